@@ -99,7 +99,7 @@ def test_frames_that_overlap_destroy_each_other(cables: Cables) -> None:
     assert [seen.collided > 0 for seen in cables.switch.log] == [True, True]
 
 
-def test_what_is_no_frame_is_not_on_the_air(cables: Cables) -> None:
+def test_what_is_no_frame_is_not_on_the_air_and_frames_take_as_long_as_agents_are_told(cables: Cables) -> None:
     good = frame(1, 1)
     strange = (b"", bytes(60), good[:30], good[:50], ethernet(b"x" * 40), frame(1, 1)[:12] + b"\x86\xdd" + good[14:])
     for data in strange:
@@ -111,9 +111,6 @@ def test_what_is_no_frame_is_not_on_the_air(cables: Cables) -> None:
     cables.carry(1)
     assert [len(cables.heard(host)) for host in (1, 2, 3)] == [1, 1, 0]
     assert cables.switch.left_out >= len(strange) + 2
-
-
-def test_a_datagram_takes_as_long_as_agents_are_told() -> None:
     config = ChannelConfig(agents=3)
     fixed, byte = flight_time(config.airtime)
     assert fixed + byte * 68 == config.airtime.total_ns(68)

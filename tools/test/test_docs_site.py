@@ -41,7 +41,7 @@ def pages(site: Path) -> list[Path]:
     return [path for path in sorted(site.rglob("*.html")) if path.name != "404.html"]
 
 
-def test_a_page_is_found_in_two_clicks(site: Path) -> None:
+def test_a_page_is_found_in_two_clicks_and_needs_no_network(site: Path) -> None:
     def linked(path: Path) -> set[Path]:
         targets = (unquote(url) for url in _LINK.findall(path.read_text(encoding="utf-8")) if "://" not in url)
         return {Path(os.path.normpath(path.parent / target)) for target in targets if target.endswith(".html")}
@@ -49,9 +49,6 @@ def test_a_page_is_found_in_two_clicks(site: Path) -> None:
     first = linked(site / "index.html")
     second = set().union(*map(linked, first))
     assert {*pages(site)} <= first | second | {site / "index.html"}
-
-
-def test_the_site_needs_no_network(site: Path) -> None:
     for path in pages(site):
         text = path.read_text(encoding="utf-8")
         loaded = [url for found in _LOADED.findall(text) for url in found if "://" in url]

@@ -138,6 +138,16 @@ def test_the_ledger_sees_broken_rules() -> None:
     assert "a second time" in judged(again).broken[0]
     opened = judged({4: {1: frame(1, 4, b"\xff" + bytes(10))}, 8: {2: frame(2, 8), 3: frame(3, 8)}})
     assert (opened.broken, opened.open_collisions) == ([], 1)
+    book = Ledger(3, 3)
+    own = Frame(1, 3, 1, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
+    book.read(3, 1, encode_extended(ExtendedFrame(own, c_s=1, probation=True)))
+    assert book.broken == ["slot 3: agent 1 claims others dead in probation, or as it leaves"]
+    book = Ledger(3, 3)
+    book.read(0, 1, encode_extended(ExtendedFrame(dataclasses.replace(own, slot=0), leases=bytes([0, 2]))))
+    [(turn, [(_, lessee)])] = book.issued.items()
+    own = dataclasses.replace(own, sender=lessee, slot=turn - 2)
+    book.read(turn - 2, lessee, encode_extended(ExtendedFrame(own, relay=((2, 1),))))
+    assert book.broken == [f"slot {turn - 2}: agent 2 hands turn {turn} on to 1"]
 
 
 def test_waits_are_measured() -> None:
@@ -159,19 +169,6 @@ def test_frames_against_the_rules_are_found_in_a_recorded_flight() -> None:
         result = Result("bag", "lockstep")
         with pytest.raises(Mismatch, match="slot 2: agent 1 sends in a turn of 3") if raises else nullcontext():
             result.take_judgement(judge)
-
-
-def test_a_ledger_notes_a_turn_handed_on_to_its_owner_and_a_claim_in_probation() -> None:
-    book = Ledger(3, 3)
-    own = Frame(1, 3, 1, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
-    book.read(3, 1, encode_extended(ExtendedFrame(own, c_s=1, probation=True)))
-    assert book.broken == ["slot 3: agent 1 claims others dead in probation, or as it leaves"]
-    book = Ledger(3, 3)
-    book.read(0, 1, encode_extended(ExtendedFrame(dataclasses.replace(own, slot=0), leases=bytes([0, 2]))))
-    [(turn, [(_, lessee)])] = book.issued.items()
-    own = dataclasses.replace(own, sender=lessee, slot=turn - 2)
-    book.read(turn - 2, lessee, encode_extended(ExtendedFrame(own, relay=((2, 1),))))
-    assert book.broken == [f"slot {turn - 2}: agent 2 hands turn {turn} on to 1"]
 
 
 def test_turns_that_an_unrecorded_frame_may_have_given_away_are_counted_and_not_judged() -> None:

@@ -53,6 +53,7 @@ def test_help_ends_with_examples_that_the_command_takes(command: str, capsys: py
     (["fly", "--ot", "a"], "option --ot: unknown; did you mean --out?"),
     (["bridge", "--config", "a", "--backend", "cflb"], "did you mean cflib?"),
     (["sweep", "--preset", "papr-12"], "did you mean paper-12?"), (["simulat"], "did you mean simulate?"),
+    (["simulate", "surplus"], "argument surplus: unknown"),
 ])  # fmt: skip
 def test_the_nearest_word_is_named(words: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert meant in refused(words, capsys)
@@ -126,10 +127,6 @@ def test_sealed_frames_on_a_network_need_a_session(
     """Else an old flight with the same key could be played again, and be believed."""
     monkeypatch.setenv("DTSA_AUTH_KEY", "7c1f0a93e4d25b6880b13f96c2de470a")
     assert "auth_session: got 0; allowed: 1 to" in refused([*words, "--interface", "lo", *session], capsys)
-
-
-def test_an_argument_that_is_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "argument surplus: unknown" in refused(["simulate", "surplus"], capsys)
 
 
 def test_what_prints_results_prints_them_as_json() -> None:

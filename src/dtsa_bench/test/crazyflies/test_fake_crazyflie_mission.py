@@ -111,14 +111,11 @@ def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
         check_standing(names, measured, fence)
 
 
-def test_a_mission_after_which_somebody_may_still_fly_has_failed() -> None:
+def test_two_as_near_as_in_a_crash_or_somebody_who_may_still_fly_fail_a_mission() -> None:
     assert mission_problem("", []) == ""
     assert mission_problem("", ["cf2"]) == "the exchange is complete; not known to have landed: cf2"
     assert mission_problem("a reason", []) == "the exchange was cut short: a reason; all have landed"
-
-
-def test_two_as_near_as_in_a_crash_cut_the_exchange_short() -> None:
-    """A run that ended by itself was taken for complete, and nobody came to rest before they landed."""
+    # A run that ended by itself was taken for complete, and nobody came to rest before they landed.
     swarm = SwarmConfig(agents=3)
     run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
     metrics, ended = FlightMetrics(run, make_scenario(swarm)), StopToken(Stop())

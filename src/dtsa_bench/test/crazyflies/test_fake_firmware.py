@@ -37,7 +37,7 @@ def test_orders_to_groups_that_it_is_not_in_are_nothing_to_it() -> None:
         assert (craft.firmware.planner.state == planner.LANDING) == lands
 
 
-def test_high_level_commands_have_no_effect_while_setpoints_are_streamed() -> None:
+def test_high_level_orders_have_no_effect_or_are_refused_where_the_firmware_says_so() -> None:
     craft = Craft()
     craft.take_off()
     craft.velocity(0.0, 0.0, 0.0)
@@ -51,6 +51,18 @@ def test_high_level_commands_have_no_effect_while_setpoints_are_streamed() -> No
     craft.ask(crtp.GENERIC_COMMANDER, 1, struct.pack("<BI", 0, 0))
     craft.fly(1.2)
     assert craft.estimate.position[2] < 0.05
+    craft = Craft()
+    take_off = struct.pack("<BBff?f", 7, 0, 1.0, 0.0, True, 1.0)
+    land = struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 1.0)
+    assert craft.ask(crtp.HIGH_LEVEL, 0, take_off) == take_off[:3] + bytes([errno.EBUSY])  # not armed
+    assert craft.ask(crtp.HIGH_LEVEL, 0, b"\x63") == b"\x63" + bytes([errno.ENOEXEC])
+    craft.take_off()
+    assert craft.ask(crtp.HIGH_LEVEL, 0, take_off) == take_off[:3] + b"\x01"  # it flies
+    assert craft.ask(crtp.HIGH_LEVEL, 0, land) == land[:3] + b"\x00"
+    craft.fly(0.5)
+    assert craft.ask(crtp.HIGH_LEVEL, 0, land) == land[:3] + b"\x01"  # it lands
+    craft.fly(0.6)
+    assert craft.mode == OFF
 
 
 def test_a_stream_that_ends_with_nothing_else_to_fly_stops_the_motors() -> None:
@@ -65,21 +77,6 @@ def test_a_stream_that_ends_with_nothing_else_to_fly_stops_the_motors() -> None:
         craft.ask(crtp.GENERIC_COMMANDER, 1, struct.pack("<BI", 0, 0))
         craft.fly(0.02)
         assert craft.mode == (FLY if ordered_before else OFF)
-
-
-def test_high_level_orders_are_refused_where_the_firmware_refuses_them() -> None:
-    craft = Craft()
-    take_off = struct.pack("<BBff?f", 7, 0, 1.0, 0.0, True, 1.0)
-    land = struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 1.0)
-    assert craft.ask(crtp.HIGH_LEVEL, 0, take_off) == take_off[:3] + bytes([errno.EBUSY])  # not armed
-    assert craft.ask(crtp.HIGH_LEVEL, 0, b"\x63") == b"\x63" + bytes([errno.ENOEXEC])
-    craft.take_off()
-    assert craft.ask(crtp.HIGH_LEVEL, 0, take_off) == take_off[:3] + b"\x01"  # it flies
-    assert craft.ask(crtp.HIGH_LEVEL, 0, land) == land[:3] + b"\x00"
-    craft.fly(0.5)
-    assert craft.ask(crtp.HIGH_LEVEL, 0, land) == land[:3] + b"\x01"  # it lands
-    craft.fly(0.6)
-    assert craft.mode == OFF
 
 
 def test_landings_are_planned_from_rest_and_ways_from_the_speed_that_is_flown() -> None:

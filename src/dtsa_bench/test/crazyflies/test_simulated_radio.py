@@ -171,6 +171,9 @@ def test_what_the_devices_cannot_do() -> None:
         room = Room(RadioSettings(dongles=1, device=device), (station(1, channel, rate),))
         room.tune(0, room.stations[0])
         assert (room.exchange(PACKET)[0][1] != b"\0") is there, (device, rate, channel)
+    room = Room(RadioSettings(dongles=2, device="pa"), ())
+    room.dongles[0].request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
+    assert room.dongles[0].sniffer.tuned is None
 
 
 SHARED = Station("", 80, "2M", esb.BROADCAST)
@@ -285,9 +288,3 @@ def test_broadcasts_between_crazyflies_are_not_for_the_ground_link() -> None:
     room.exchange(esb.BROADCAST + PACKET, at_ns=10_000 * US)
     assert room.heard == [(0, PACKET)]
     room.exchange(esb.BROADCAST, at_ns=15_000 * US)  # an address alone is no packet
-
-
-def test_a_crazyradio_pa_has_no_sniffer_mode() -> None:
-    room = Room(RadioSettings(dongles=2, device="pa"), ())
-    room.dongles[0].request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
-    assert room.dongles[0].sniffer.tuned is None

@@ -61,11 +61,14 @@ def test_any_two_agents_and_any_two_series_are_told_apart(sight: str) -> None:
             assert apart > least, f"{first} and {second}: {apart:.1f}"
 
 
-def test_every_colour_stands_out_from_light_and_dark_paper_and_ids_can_be_read_on_it() -> None:
+def test_every_colour_stands_out_and_comes_again_with_another_dash_and_shape() -> None:
     for colour in AGENT_COLOURS:
         for other, least in (("#ffffff", 1.5), ("#181f27", 1.5), (ink_on(colour), 4.0)):
             light, dark = sorted((luminance(colour), luminance(other)), reverse=True)
             assert (light + 0.05) / (dark + 0.05) > least, (colour, other)
+    turns = [agent_turn(agent) for agent in range(1, 4 * len(AGENT_COLOURS) + 1)]
+    looks = {(agent_colour(k), DASHES[turn], SHAPES[turn]) for k, turn in enumerate(turns, 1)}
+    assert len(looks) == len(turns)
 
 
 def test_an_agent_has_one_colour_in_page_picture_layouts_and_markers() -> None:
@@ -99,9 +102,3 @@ def test_an_agent_has_one_colour_in_page_picture_layouts_and_markers() -> None:
     numbered = [(int(found[1]), colour) for name, colour in own if (found := re.search(r"(?:age of |^/)cf(\d+)", name))]
     assert len(numbered) == 4 * count
     assert all(colour == wanted[number - 1] for number, colour in numbered)
-
-
-def test_colours_that_come_again_have_another_dash_and_shape() -> None:
-    turns = [agent_turn(agent) for agent in range(1, 4 * len(AGENT_COLOURS) + 1)]
-    looks = {(agent_colour(k), DASHES[turn], SHAPES[turn]) for k, turn in enumerate(turns, 1)}
-    assert len(looks) == len(turns)

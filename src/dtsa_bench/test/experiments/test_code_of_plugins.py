@@ -83,7 +83,7 @@ def test_a_plug_in_that_does_not_fly_does_not_count(tmp_path: Path) -> None:
     assert "2 of 2 runs are there already" in sweep(tmp_path, "tdma")[0]
 
 
-def test_versions_of_python_and_numpy_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_versions_data_and_the_compiled_kernel_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     digest = provenance.code_digest.__wrapped__
     digests = {digest()}
     monkeypatch.setattr(provenance.np, "__version__", "0.0")
@@ -91,9 +91,6 @@ def test_versions_of_python_and_numpy_count(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(provenance.platform, "python_version", lambda: "3.0.0")
     digests.add(digest())
     assert len(digests) == 3
-
-
-def test_data_and_the_compiled_kernel_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     package = tmp_path / "counted_package"
     (package / "__pycache__").mkdir(parents=True)

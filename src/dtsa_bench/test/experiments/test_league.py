@@ -44,20 +44,11 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_what_is_frozen_stays_and_seeds_follow_from_word_cell_and_number() -> None:
+def test_what_is_frozen_stays_and_all_built_in_schemes_fly_every_cell() -> None:
     assert LEAGUE.digest == "ed7a1d2694d06ac4"  # a change needs a league of another number: docs/how-to/league.md
     seeds = {LEAGUE.seed(cell, k) for cell in LEAGUE.cells for k in range(LEAGUE.seed_count)}
     assert len(seeds) == len(LEAGUE.cells) * LEAGUE.seed_count
     assert all(0 <= seed < 2**31 for seed in seeds)
-
-
-def test_the_simulator_flies_as_it_did_when_the_entries_were_flown() -> None:
-    """One flight of each entry: no published number has changed."""
-    for number, published in enumerate(read_entries(PUBLISHED)):
-        assert check_entry(LEAGUE, published, sample=1, seed=number, jobs=1) == (1, []), published["name"]
-
-
-def test_all_built_in_schemes_are_entrants_and_fly_every_cell() -> None:
     entered = {settings["policy"] for settings in LEAGUE.entrants.values()}
     own = {name for name, point in POLICIES.plug_ins().items() if point.module.startswith("dtsa_bench.")}
     assert entered >= {*POLICIES.rows, *own}
@@ -66,6 +57,16 @@ def test_all_built_in_schemes_are_entrants_and_fly_every_cell() -> None:
         check_scheme(scheme)
         for cell in LEAGUE.cells:
             run_config(LEAGUE.settings(cell, scheme, 1))
+
+
+def test_published_entries_are_whole_and_the_simulator_flies_as_it_did() -> None:
+    """One flight of each entry: no published number has changed."""
+    for number, published in enumerate(read_entries(PUBLISHED)):
+        assert check_entry(LEAGUE, published, sample=1, seed=number, jobs=1) == (1, []), published["name"]
+    table = LeagueTable(LEAGUE, read_entries(PUBLISHED))
+    assert table.complete
+    assert len(table.lines()) >= 21
+    assert len(PUBLISHED.read_text().splitlines()) <= 1000
 
 
 def test_any_changed_value_is_found_and_named(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -185,10 +186,3 @@ def test_a_lost_flight_counts_with_the_cells_age() -> None:
     found = scores(LEAGUE, made_up("x", [50.0, 5000.0, 200.0], crashed=1)["flights"])
     assert found.lost.count == 1
     assert found.age_ms[0] == pytest.approx((1200 * 1200 * 200) ** (1 / 3))  # a larger age counts no more than that
-
-
-def test_the_published_table_has_all_flights_of_all_entries() -> None:
-    table = LeagueTable(LEAGUE, read_entries(PUBLISHED))
-    assert table.complete
-    assert len(table.lines()) >= 21
-    assert len(PUBLISHED.read_text().splitlines()) <= 1000

@@ -76,7 +76,7 @@ class Failing(ChannelObserver):
             raise OSError("disk full")
 
 
-def test_observers_are_told_in_order_and_closed_once_even_if_one_fails() -> None:
+def test_observers_are_told_in_order_and_closed_once_and_errors_are_named() -> None:
     pages: list[str] = []
     observers = Observers()
     for observer in (Diary(pages, "a"), Failing(None), Diary(pages, "b")):
@@ -87,8 +87,6 @@ def test_observers_are_told_in_order_and_closed_once_even_if_one_fails() -> None
     observers.close()
     assert pages == ["apublished 3", "bpublished 3", "aclosed", "bclosed"]
 
-
-def test_an_error_of_the_projects_own_says_by_itself_what_is_wrong() -> None:
     class Broken(ChannelObserver):
         def agent_silent(self, agent: int) -> None:
             raise LocalProtocolError(f"cf{agent} is gone")

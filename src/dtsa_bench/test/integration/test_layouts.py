@@ -68,12 +68,11 @@ def panels(node: Any) -> list[str]:
     return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
 
 
-def test_files_are_what_the_script_writes(make: ModuleType) -> None:
+def test_files_are_what_the_script_writes_and_grow_again_from_fewer_agents(
+    make: ModuleType, tmp_path, monkeypatch
+) -> None:
     assert make.FOXGLOVE.read_text(encoding="utf-8") == make.foxglove()
     assert make.PLOTJUGGLER.read_text(encoding="utf-8") == make.plotjuggler()
-
-
-def test_layouts_that_were_made_for_fewer_agents_grow_again(make, tmp_path, monkeypatch):
     wanted = make.foxglove(), make.plotjuggler()
     monkeypatch.setattr(make, "FOXGLOVE", tmp_path / "layout.json")
     monkeypatch.setattr(make, "PLOTJUGGLER", tmp_path / "layout.xml")
@@ -162,7 +161,7 @@ def test_no_topic_has_numbers_that_plotjuggler_refuses() -> None:
     assert "int64" in numbers(TYPES["/swarm/transmission"])  # the check sees them; nanoseconds within a slot are small
 
 
-def test_other_numbers_of_agents(make: ModuleType) -> None:
+def test_other_numbers_of_agents_and_nonsense(make: ModuleType) -> None:
     assert "/cf70/odom" in make.foxglove(70)
     assert "/cf3/odom" not in make.foxglove(2)
     for agents in (1, 3, 12):
@@ -172,16 +171,13 @@ def test_other_numbers_of_agents(make: ModuleType) -> None:
         curves = [curve.get("name", "") for curve in ElementTree.fromstring(make.plotjuggler(agents)).iter("curve")]
         assert sum(name.startswith("age of") for name in curves) == agents
         assert sum(name.startswith("distance") for name in curves) == pairs
-
-
-def test_nonsense_is_refused() -> None:
     for words in (["many"], ["0"], ["3", "4"]):
         result = subprocess.run([sys.executable, str(LAYOUTS / "make.py"), *words], capture_output=True, text=True)
         assert result.returncode == 2
         assert "allowed: one number" in result.stderr
 
 
-def test_the_model_of_a_quadcopter_hangs_on_the_frame_that_transforms_name() -> None:
+def test_the_model_hangs_on_its_frame_and_the_picture_shows_markers() -> None:
     body = names.body_frame(names.agent_namespace(3, "/north"))
     text = (SHARE / "urdf/quadcopter.urdf").read_text(encoding="utf-8").replace("${PREFIX}", "north/cf3/")
     robot = ElementTree.fromstring(text)
@@ -190,9 +186,6 @@ def test_the_model_of_a_quadcopter_hangs_on_the_frame_that_transforms_name() -> 
     parents = {parent.attrib["link"] for parent in robot.iter("parent")}
     assert links - children == parents == {body}
     assert len(links) == 5
-
-
-def test_the_picture_of_the_swarm_shows_its_markers() -> None:
     content = yaml.safe_load((SHARE / "rviz/swarm.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
     topics = [display["Topic"]["Value"] for display in content["Displays"] if "Topic" in display]
     assert topics == [f"{names.SWARM}/{names.MARKERS}"]

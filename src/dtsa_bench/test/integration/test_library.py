@@ -49,16 +49,13 @@ def in_a_new_process(program: str) -> str:
     return result.stdout
 
 
-def test_every_public_name_is_there_and_no_other() -> None:
+def test_every_public_name_is_there_and_importing_it_loads_nothing_heavy() -> None:
     assert len(set(dtsa.__all__)) == len(dtsa.__all__)
     for name in dtsa.__all__:
         assert getattr(dtsa, name) is not None
     assert dir(dtsa) == sorted(dtsa.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         dtsa.nothing  # noqa: B018
-
-
-def test_importing_it_loads_nothing_heavy() -> None:
     program = f"import sys, dtsa; print([name for name in {HEAVY} if name in sys.modules])"
     assert in_a_new_process(program).strip() == "[]"
     program = "import sys, dtsa; dtsa.simulate; dtsa.sweep; dtsa.Agent; dtsa.Channel"

@@ -258,12 +258,9 @@ def test_axes_are_not_called_like_columns_of_the_results(axis: str) -> None:
     assert caught.value.field == f"axes.{axis}"
 
 
-def test_all_columns_of_the_results_are_reserved() -> None:
+def test_columns_of_results_are_reserved_and_every_setting_has_a_help_text() -> None:
     assert set(MEASURES) <= RESERVED
     settings_names = {spec.name for cls in (SwarmConfig, ChannelConfig, RunLimits) for spec in settings_of(cls)}
     assert RESERVED & settings_names == {"seed"}
-
-
-def test_every_setting_has_a_help_text() -> None:
     for cls in (SwarmConfig, ChannelConfig, ClockConfig, RunLimits, RunConfig, SafetySettings, FleetConfig):
         assert all(spec.help for spec in settings_of(cls)), cls.__name__

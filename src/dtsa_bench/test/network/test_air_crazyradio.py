@@ -96,7 +96,7 @@ def own(agent: int) -> dict[str, int]:
     return {"clock_offset_ns": OFFSET_NS * agent, "clock_drift_ppb": 20_000 * (agent - 2)}
 
 
-def test_agents_become_one_group_and_hear_each_other(flight: Flight) -> None:
+def test_agents_become_one_group_on_one_time_line_and_keep_the_rules(flight: Flight) -> None:
     helpers.check_merged(flight.merged, flight.whole, 300)
     assert flight.merged["missing"] == []
     for agent, summary in flight.summaries.items():
@@ -104,18 +104,12 @@ def test_agents_become_one_group_and_hear_each_other(flight: Flight) -> None:
         assert (summary["dropped_by_dongle"], summary["garbled_transfers"], summary["strange_stamps"]) == (0, 0, 0)
     assert [line for line in flight.said if not line.startswith(("flies: ", "is new", "listens"))] == []
     assert {read(path).port.name for path in flight.bags} == {"crazyradio"}
-
-
-def test_stamps_of_the_dongles_tell_when_frames_arrived(flight: Flight) -> None:
-    """A dongle sends up to a millisecond after it was told to; no more than that is left of the equations."""
+    # A dongle sends up to a millisecond after it was told to; no more than that is left of the equations.
     line = flight.merged["time_line"]
     assert flight.merged["not_on_the_time_line"] == []
     for agent in AGENTS[1:]:
         assert line["clocks"][f"cf{agent}"]["offset_ms"] == pytest.approx(OFFSET_NS / 1e6 * (agent - 1), abs=3.0)
     assert line["residual_us"]["p50"] < 1000
-
-
-def test_who_only_listens_finds_that_all_keep_the_rules(flight: Flight) -> None:
     found = flight.sniffed
     assert found["heard"].keys() == {f"cf{agent}" for agent in AGENTS}
     assert (found["rules_broken"], found["slots_with_two_senders"]) == (0, 0), found["which"]

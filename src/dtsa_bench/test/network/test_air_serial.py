@@ -90,7 +90,7 @@ def own(agent: int) -> dict[str, int]:
     return {"clock_offset_ns": agent * 10**9, "clock_drift_ppb": 30_000 * (agent - 2)}
 
 
-def test_groups_become_one_flight_whose_decisions_are_made_again(flight: Flight) -> None:
+def test_groups_become_one_flight_in_which_all_keep_the_rules(flight: Flight) -> None:
     helpers.check_merged(flight.merged, flight.whole, 200)
     assert run_data(flight.whole)["slots"]["count"] > 100
     for one in flight.agents:
@@ -100,9 +100,6 @@ def test_groups_become_one_flight_whose_decisions_are_made_again(flight: Flight)
         assert found["arrivals_off_ms"].keys() == {"p50", "p99", "max"}
     assert flight.agents[1].agent.summary()["times_unplugged"] == 1
     assert flight.agents[1].agent.summary()["unsent_because"].keys() <= {"the device is not there", "too late"}
-
-
-def test_who_listens_by_a_modem_finds_that_all_keep_the_rules(flight: Flight) -> None:
     assert flight.sniffed["heard"].keys() == {"cf1", "cf2", "cf3"}
     assert flight.sniffed["slots_with_two_senders"] == 0  # it misses frames: of rules it cannot be sure
     assert flight.shown == "listener"

@@ -105,15 +105,7 @@ def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
         stranger.socket.send(data)
 
 
-def test_who_only_listens_finds_that_all_keep_the_rules(flight: Flight) -> None:
-    found = flight.sniffed
-    assert found["heard"].keys() == {"cf1", "cf2", "cf3"}
-    assert found["frames_judged"] > 10
-    assert (found["rules_broken"], found["slots_with_two_senders"]) == (0, 0), found["which"]
-    assert {"not ours", "other settings", "rejected", "repeated"} <= found["not_taken_in"].keys()
-
-
-def test_groups_become_one_flight_whose_decisions_are_made_again(flight: Flight) -> None:
+def test_groups_become_one_flight_on_one_time_line_in_which_all_keep_the_rules(flight: Flight) -> None:
     helpers.check_merged(flight.merged, flight.whole, 150)
     assert flight.merged["clock_spread_ms"]["end"] < CONFIG.slot_ms / 2
     for agent, summary in flight.summaries.items():
@@ -123,13 +115,21 @@ def test_groups_become_one_flight_whose_decisions_are_made_again(flight: Flight)
     assert found["slots"]["collision"] == 0
     assert found["min_distance_m"] > 0.2
     assert 0 < found["age_mean_slots"] < 4 * CONFIG.agents * CONFIG.anchor_every
-
-
-def test_what_is_not_ours_is_counted_by_reason(flight: Flight) -> None:
+    found = flight.sniffed
+    assert found["heard"].keys() == {"cf1", "cf2", "cf3"}
+    assert found["frames_judged"] > 10
+    assert (found["rules_broken"], found["slots_with_two_senders"]) == (0, 0), found["which"]
+    assert {"not ours", "other settings", "rejected", "repeated"} <= found["not_taken_in"].keys()
     for summary in flight.summaries.values():
         found = summary["not_taken_in"]
         assert found["not ours"] >= 2
         assert {"length", "other settings", "no frame", "rejected", "repeated", "other time"} <= found.keys()
+    line = flight.merged["time_line"]
+    assert flight.merged["not_on_the_time_line"] == []
+    assert flight.merged["missing"] == [4]
+    for agent in (2, 3):
+        assert line["clocks"][f"cf{agent}"]["offset_ms"] == pytest.approx(OFFSET_NS / 1e6 * (agent - 1), abs=2.0)
+    assert line["residual_us"]["p50"] < 1000
 
 
 def test_a_page_is_told_what_a_listener_heard(flight: Flight) -> None:
@@ -165,15 +165,6 @@ def test_a_page_is_told_what_a_listener_heard(flight: Flight) -> None:
     last = flight.told[-1]
     assert last["refused"] >= 8  # what the stranger said
     assert (last["tables"], last["agree"]) == (0, [0, 0])
-
-
-def test_bags_lie_on_one_time_line(flight: Flight) -> None:
-    line = flight.merged["time_line"]
-    assert flight.merged["not_on_the_time_line"] == []
-    assert flight.merged["missing"] == [4]
-    for agent in (2, 3):
-        assert line["clocks"][f"cf{agent}"]["offset_ms"] == pytest.approx(OFFSET_NS / 1e6 * (agent - 1), abs=2.0)
-    assert line["residual_us"]["p50"] < 1000
 
 
 def test_a_bag_that_lies_is_found(flight: Flight) -> None:

@@ -78,16 +78,13 @@ def test_what_is_missing_is_said(delays, hears, silent, missing):
     assert checked(delays, hears, silent).result()["missing"] == missing
 
 
-def test_a_check_that_is_too_short_says_so() -> None:
+def test_it_lasts_until_all_can_tell_and_one_that_is_too_short_says_so() -> None:
     check = Check(1, CONFIG, NETWORK)
     for slot in range(100, 112):
         sender = slot % 4 + 1
         heard = [said(sender, slot, MS, ALL[sender])] if sender > 1 else []
         check.slot(record(slot, sender, heard, anew=slot == 100))
     assert [line.split(":")[1] for line in check.result()["missing"]] == [" check for longer"] * 3
-
-
-def test_it_lasts_until_all_can_tell() -> None:
     lease = SwarmConfig(agents=6, policy="lease", slot_ms=150.0)
     assert lasts_s(lease) == pytest.approx((3 * 5 + 2 * 15 + 20) * 6 * 0.15)
     assert lasts_s(CONFIG) == 5.0

@@ -53,16 +53,13 @@ def killed() -> FinishedFlight:
     return FinishedFlight(flight, {"seed": 1}, scenario, tuple(senders), place, np.zeros(slots))
 
 
-def test_the_readme_has_the_numbers_of_the_demo(flights: dict[str, FinishedFlight]) -> None:
+def test_the_readme_has_the_numbers_of_the_demo_and_its_story_is_true(flights: dict[str, FinishedFlight]) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     lines = [HEAD, *table_rows(STEPS, flights)]
     head, *rows = ["| " + " | ".join(line) + " |" for line in lines]
     table = "\n".join([head.replace("|  |", "| |"), "|---" * len(HEAD) + "|", *rows])
     assert table in text, table
-
-
-def test_the_story_is_true(flights: dict[str, FinishedFlight]) -> None:
-    """What the sentences say without a number."""
+    # What the sentences say without a number.
     value = {key: flown.summary for key, flown in flights.items()}
     assert value["all-tdma"]["estimate_error_mean_m"] < 0.1 * value["all-tdma-hold"]["estimate_error_mean_m"]
     assert value["two-dtsa"]["age_mean_slots"] < value["two-lease"]["age_mean_slots"] < 2.0
@@ -87,7 +84,9 @@ def test_death_new_use_and_return_are_found(flights: dict[str, FinishedFlight]) 
     assert "speaks 7.2 s later" in step_text(4, flights)[1]
 
 
-def test_picture(flights: dict[str, FinishedFlight], tmp_path: Path) -> None:
+def test_picture_has_all_colours_and_animation_is_small_and_moves(
+    flights: dict[str, FinishedFlight], tmp_path: Path
+) -> None:
     draw_demo(tmp_path / "demo.png", STEPS, flights)
     with Image.open(tmp_path / "demo.png") as picture:
         assert picture.width > 1600
@@ -95,9 +94,6 @@ def test_picture(flights: dict[str, FinishedFlight], tmp_path: Path) -> None:
     for colour in AGENT_COLOURS:
         wanted = [int(colour[start : start + 2], 16) for start in (1, 3, 5)]
         assert np.abs(seen - wanted).max(axis=1).min() < 16, colour
-
-
-def test_animation_is_small_and_moves(flights: dict[str, FinishedFlight], tmp_path: Path) -> None:
     path = tmp_path / "demo.gif"
     draw_animation(path, flights, slots := 20)
     assert path.stat().st_size < 2_000_000 * slots / 80

@@ -112,7 +112,7 @@ def test_slots_carry_sender_outcome_and_reason(data: dict[str, Any], flights: di
         assert slots["count"] == len(receptions)
 
 
-def test_shares_of_the_channel_and_of_reasons_add_up(data: dict[str, Any]) -> None:
+def test_shares_add_up_and_ages_follow_from_who_was_heard(data: dict[str, Any]) -> None:
     for run in data.values():
         assert np.allclose(np.sum(list(run["channel"]["share"].values()), axis=0), 1, atol=2e-4)
         assert np.allclose(np.sum(run["decisions"]["share"], axis=0), 1, atol=2e-3)
@@ -121,9 +121,17 @@ def test_shares_of_the_channel_and_of_reasons_add_up(data: dict[str, Any]) -> No
     assert data["clean"]["summary"]["lost_fraction"] == 0
     assert data["lossy"]["decisions"]["disagree"] > 0
     assert data["clean"]["decisions"]["disagree"] == 0
+    clean, lossy = (data[name]["summary"] for name in ("clean", "lossy"))
+    assert 0 < clean["age_mean_slots"] <= clean["age_max_slots"]
+    assert lossy["age_mean_slots"] > clean["age_mean_slots"]
+    rows = data["clean"]["table"]
+    assert [row["id"] for row in rows] == list(range(1, 7))
+    assert sum(row["moving"] for row in rows) == 4
+    assert all((row["age_mean"] is not None) == row["moving"] for row in rows)
+    assert sum(row["sent"] for row in rows) == clean["frames"]
 
 
-def test_distances_are_those_of_the_positions(flights: dict[str, Path]) -> None:
+def test_distances_and_scene_are_those_of_the_positions(flights: dict[str, Path], data: dict[str, Any]) -> None:
     with Bag(flights["lossy"]) as bag:
         run = load_run(bag)
     found = pair_distances(run)
@@ -138,9 +146,6 @@ def test_distances_are_those_of_the_positions(flights: dict[str, Path]) -> None:
     assert found.pairs == sorted(brute, key=lambda pair: brute[pair].min())[: len(found.pairs)]
     for pair, series in zip(found.pairs, found.series, strict=True):
         assert np.allclose(series, brute[pair])
-
-
-def test_the_scene_is_where_the_agents_were(data: dict[str, Any], flights: dict[str, Path]) -> None:
     scene = data["clean"]["scene"]
     with Bag(flights["clean"]) as bag:
         run = load_run(bag)
@@ -150,17 +155,6 @@ def test_the_scene_is_where_the_agents_were(data: dict[str, Any], flights: dict[
         row = np.abs((run.motion.time_ns - run.start_ns) / 1e9 - times[frame]).argmin()
         assert np.abs(places[frame] - run.motion.position[row]).max() <= 0.51 * scene["scale"]
     assert scene["scale"] < 0.001
-
-
-def test_ages_follow_from_who_was_heard(data: dict[str, Any]) -> None:
-    clean, lossy = (data[name]["summary"] for name in ("clean", "lossy"))
-    assert 0 < clean["age_mean_slots"] <= clean["age_max_slots"]
-    assert lossy["age_mean_slots"] > clean["age_mean_slots"]
-    rows = data["clean"]["table"]
-    assert [row["id"] for row in rows] == list(range(1, 7))
-    assert sum(row["moving"] for row in rows) == 4
-    assert all((row["age_mean"] is not None) == row["moving"] for row in rows)
-    assert sum(row["sent"] for row in rows) == clean["frames"]
 
 
 @pytest.fixture(scope="module")

@@ -79,7 +79,7 @@ def test_ages_and_beliefs_are_those_of_the_report(bag: Path, track: Track) -> No
                 assert heard[agent - 1] == age
 
 
-def test_a_track_keeps_a_limited_number_of_moments() -> None:
+def test_a_track_and_what_waits_for_a_page_are_limited() -> None:
     found = Track("long")
     found.begin({})
     for slot in range(MOST_MOMENTS + 10):
@@ -92,9 +92,6 @@ def test_a_track_keeps_a_limited_number_of_moments() -> None:
     first, moments = found.since(0, 100)
     assert len(moments) <= 4
     assert moments[-1].slot == 4
-
-
-def test_what_waits_for_a_page_is_limited() -> None:
     swarm = Swarm(SwarmConfig(agents=AGENTS))
     moments, reason = Moments(swarm.scenario), np.zeros(AGENTS, np.uint8)
     for slot in range(5 * MOST_FRAMES // 2):

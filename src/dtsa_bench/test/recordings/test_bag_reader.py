@@ -176,15 +176,12 @@ def test_what_is_no_bag_is_said_in_one_line(tmp_path: Path) -> None:
             assert isinstance(caught.value, ConfigError)
 
 
-def test_an_unfinished_bag_points_to_recover(run: SyntheticRun, tmp_path: Path) -> None:
+def test_bags_unfinished_damaged_or_of_others_are_refused_by_what_they_lack(run: SyntheticRun, tmp_path: Path) -> None:
     whole = run.writer.path.read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(UnusableBag, match=r"not closed.*tools/dtsa recover"):
         Bag(cut)
-
-
-def test_a_damaged_chunk_is_met_as_an_error(run: SyntheticRun, tmp_path: Path) -> None:
     data = bytearray(run.writer.path.read_bytes())
     with Bag(run.writer.path) as bag:
         place = bag._chunks[1].chunk_start_offset + 200
@@ -192,9 +189,6 @@ def test_a_damaged_chunk_is_met_as_an_error(run: SyntheticRun, tmp_path: Path) -
     (tmp_path / "bad.mcap").write_bytes(data)
     with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match=r"damaged chunk.*recover"):
         list(bag.messages())
-
-
-def test_a_foreign_mcap_is_refused_with_its_encoding(tmp_path: Path) -> None:
     path = tmp_path / "json.mcap"
     writer = Writer(str(path))
     writer.start(profile="")
@@ -204,9 +198,6 @@ def test_a_foreign_mcap_is_refused_with_its_encoding(tmp_path: Path) -> None:
     writer.finish()
     with pytest.raises(UnusableBag, match=r"/thing is recorded as json/jsonschema"):
         Bag(path)
-
-
-def test_a_ros_bag_of_somebody_else_can_be_read_but_has_no_configuration(tmp_path: Path) -> None:
     kind = "nav_msgs/msg/Odometry"
     with BagWriter(tmp_path / "bag", None) as writer:
         writer.add_topic("/odom", kind, "reliable", definition(kind))

@@ -34,7 +34,7 @@ def content(run: SyntheticRun) -> dict:
     return loaded["rosbag2_bagfile_information"]
 
 
-def test_metadata_has_every_mandatory_field(run: SyntheticRun) -> None:
+def test_metadata_has_every_mandatory_field_and_describes_each_topic(run: SyntheticRun) -> None:
     assert sorted(path.name for path in run.writer.directory.iterdir()) == ["flight_0.mcap", "metadata.yaml"]
     found = content(run)
     times = [log_ns for rows in run.written.values() for log_ns, _, _ in rows]
@@ -51,9 +51,6 @@ def test_metadata_has_every_mandatory_field(run: SyntheticRun) -> None:
     assert found["custom_data"]["seed"] == "7"
     assert json.loads(found["custom_data"]["configuration"])["swarm"]["agents"] == 4
     assert found["custom_data"]["version"]
-
-
-def test_metadata_describes_each_topic(run: SyntheticRun) -> None:
     topics = {
         entry["topic_metadata"]["name"]: (entry["topic_metadata"], entry["message_count"])
         for entry in content(run)["topics_with_message_count"]
@@ -72,7 +69,7 @@ def test_metadata_describes_each_topic(run: SyntheticRun) -> None:
         }  # fmt: skip
 
 
-def test_mcap_reads_header_schemas_channels_and_indexes(run: SyntheticRun) -> None:
+def test_mcap_reads_header_schemas_channels_indexes_and_both_metadata_records(run: SyntheticRun) -> None:
     with run.writer.path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
@@ -94,9 +91,6 @@ def test_mcap_reads_header_schemas_channels_and_indexes(run: SyntheticRun) -> No
         for _, channel, message in reader.iter_messages(log_time_order=False):
             found.setdefault(channel.topic, []).append((message.log_time, message.publish_time, message.data))
         assert found == run.written
-
-
-def test_metadata_record_stands_at_the_start_and_at_the_end(run: SyntheticRun) -> None:
     with run.writer.path.open("rb") as stream:
         records = list(make_reader(stream).iter_metadata())
     assert [record.name for record in records] == ["rosbag2", "rosbag2"]
@@ -141,7 +135,7 @@ def test_definition_lists_each_dependency_once_and_keeps_comments() -> None:
     assert schema.concatenate("a/msg/Root", texts.__getitem__) == "\n".join([texts["a/msg/Root"], *parts])
 
 
-def test_a_directory_in_use_and_an_unknown_compression_are_refused(tmp_path: Path) -> None:
+def test_directories_in_use_closed_bags_and_wrong_messages_are_refused(tmp_path: Path) -> None:
     (tmp_path / "something").write_text("precious")
     for path in (tmp_path, tmp_path / "something"):
         with pytest.raises(ConfigError, match="empty or does not exist"):
@@ -149,17 +143,11 @@ def test_a_directory_in_use_and_an_unknown_compression_are_refused(tmp_path: Pat
     with pytest.raises(ConfigError, match="zstd, lz4, none"):
         BagWriter(tmp_path / "bag", {}, compression="rar")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
-
-
-def test_nothing_is_swallowed_after_closing(tmp_path: Path) -> None:
-    run = synthetic_bag(tmp_path / "bag", slots=1)
+    run = synthetic_bag(tmp_path / "closed", slots=1)
     run.writer.close()
     for action in (lambda: run.slot(1), run.writer.flush, lambda: run.writer.add_topic("/x", "a/msg/B")):
         with pytest.raises(BagError, match="closed"):
             action()
-
-
-def test_wrong_messages_are_refused(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag", {}) as writer:
         kind = "nav_msgs/msg/Odometry"
         channel = writer.add_topic("/odom", kind, "reliable", definition(kind))

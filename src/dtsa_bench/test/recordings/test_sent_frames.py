@@ -140,9 +140,14 @@ def fault(found: np.ndarray, carried: np.ndarray | None = None) -> tuple[int, fl
     return odometry_fault(times, found, np.zeros(SLOTS, bool) if carried is None else carried, reports, SLOT_NS)
 
 
-def test_an_agent_stays_where_it_was_called_until_its_first_report() -> None:
+def test_an_agent_stays_where_it_was_until_its_first_report_and_where_one_is_late() -> None:
     _, found, _ = rows()
     assert fault(found) is None
+    _, found, _ = rows()
+    late = np.arange(SLOTS) == FIRST + 1
+    found[late] = found[FIRST]
+    assert fault(found) is not None
+    assert fault(found, late) is None
 
 
 @pytest.mark.parametrize("slot", [2, FIRST - 1, FIRST, FIRST + 2])
@@ -150,11 +155,3 @@ def test_a_place_that_was_not_reported_is_found(slot: int) -> None:
     _, found, _ = rows()
     found[slot, 1] += 0.01
     assert fault(found) == (slot, pytest.approx(0.01, abs=0.02), pytest.approx(1e-6, abs=1e-9))
-
-
-def test_a_slot_whose_report_came_too_late_keeps_the_place_before() -> None:
-    _, found, _ = rows()
-    late = np.arange(SLOTS) == FIRST + 1
-    found[late] = found[FIRST]
-    assert fault(found) is not None
-    assert fault(found, late) is None

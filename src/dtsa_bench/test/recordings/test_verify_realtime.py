@@ -160,7 +160,7 @@ def test_a_missing_message_is_found_without_the_digest(flown: Path, tmp_path: Pa
     assert dropped
 
 
-def test_untouched_bags_pass_and_what_is_not_checked_is_said(flown: Path, tmp_path: Path) -> None:
+def test_untouched_bags_pass_also_those_from_before_radios_had_names(flown: Path, tmp_path: Path) -> None:
     result = rewritten(flown, tmp_path / "same", untouched)
     assert result.ok, result.difference
     for what in ("frames equal to their sender's state", "frames heard as they were sent", "verdicts made again",
@@ -171,9 +171,6 @@ def test_untouched_bags_pass_and_what_is_not_checked_is_said(flown: Path, tmp_pa
     with Bag(flown / "bag") as bag:
         sent = sum(message.topic == "/swarm/frame" for message in bag.messages())
     assert result.checked["frames that nobody heard together with another"] == sent
-
-
-def test_bags_from_before_radios_had_names_are_checked_as_they_were(flown: Path, tmp_path: Path) -> None:
     with Bag(flown / "bag") as bag:
         channel = {name: value for name, value in bag.config["channel"].items() if name != "radio"}
     result = rewritten(flown, tmp_path / "old", untouched, channel=channel)

@@ -86,12 +86,21 @@ def test_a_crash_is_any_distance_below_the_limit_at_any_instant(bulge: float, cr
     assert summary["slots"]["collision"] == 1
 
 
-def test_a_crash_need_not_end_the_run() -> None:
+def test_a_crash_need_not_end_the_run_and_nothing_to_measure_is_none() -> None:
     metrics, scenario = pair_on_a_line(stop_on_crash=False)
     assert not metrics.update(0, along(scenario, 0.5)[None], None, SUCCESS)
     assert not metrics.update(1, along(scenario, 0.6)[None], None, SUCCESS)
     assert metrics.crash_slot == 1
     assert metrics.summary()["collided"] is True
+    run = RunConfig(SwarmConfig(agents=1, moving=0), limits=RunLimits(tail_s=0.02))
+    scenario = make_scenario(run.swarm)
+    metrics = FlightMetrics(run, scenario)
+    ends = [metrics.update(slot, scenario.start[None].copy(), None, SUCCESS) for slot in range(3)]
+    summary = metrics.summary()
+    assert ends == ["", "", COMPLETED]
+    assert {
+        summary[key] for key in ("min_distance_m", "efficiency_mean", "age_mean_slots", "estimate_error_mean_m")
+    } == {None}
 
 
 def test_efficiency_is_displacement_over_path_of_movers_only() -> None:
@@ -104,18 +113,6 @@ def test_efficiency_is_displacement_over_path_of_movers_only() -> None:
     metrics.update(0, np.stack([corner, end]), None, SUCCESS)
     assert metrics.efficiencies() == pytest.approx({1: 5.0 / 7.0, 2: 1.0})
     assert metrics.summary()["efficiency_mean"] == pytest.approx((5.0 / 7.0 + 1.0) / 2)
-
-
-def test_nothing_to_measure_is_none_not_a_number() -> None:
-    run = RunConfig(SwarmConfig(agents=1, moving=0), limits=RunLimits(tail_s=0.02))
-    scenario = make_scenario(run.swarm)
-    metrics = FlightMetrics(run, scenario)
-    ends = [metrics.update(slot, scenario.start[None].copy(), None, SUCCESS) for slot in range(3)]
-    summary = metrics.summary()
-    assert ends == ["", "", COMPLETED]
-    assert {
-        summary[key] for key in ("min_distance_m", "efficiency_mean", "age_mean_slots", "estimate_error_mean_m")
-    } == {None}
 
 
 def fly(run: RunConfig, slots: int) -> tuple[FlightMetrics, FlightMetrics, dict[str, list[float]]]:

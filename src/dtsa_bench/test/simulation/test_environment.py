@@ -158,15 +158,12 @@ def test_rewards_are_the_ages_that_the_summary_counts() -> None:
     assert infos["agent_3"]["summary"]["waking_age_mean_slots"] == total / number
 
 
-def test_a_crash_ends_the_flight_and_costs_the_penalty() -> None:
+def test_a_crash_ends_a_flight_and_flights_follow_each_other_by_their_seeds() -> None:
     env = parallel_env(reward=dtsa.env.MeanAge(crash=500.0), collision_m=5.0, **SHORT)
     *_, rewards, terminated, _, infos = flown(env, tdma)[-1]
     assert infos["agent_1"]["summary"]["collided"]
     assert set(terminated.values()) == {True}
     assert all(-520.0 < worth < -499.0 for worth in rewards.values())
-
-
-def test_flights_follow_each_other_by_their_seeds() -> None:
     env = parallel_env(slots=30, **SHORT)
     first = flown(env, tdma, seed=11)
     assert set(first[-1][-2].values()) == {True}
@@ -201,7 +198,7 @@ def test_what_cannot_be_used_is_named() -> None:
         env.step(dict.fromkeys(env.agents, 0))
 
 
-def test_pettingzoo_finds_nothing_wrong() -> None:
+def test_pettingzoo_finds_nothing_wrong_and_the_last_slot_can_be_read() -> None:
     from pettingzoo.test import parallel_api_test, parallel_seed_test
     from pettingzoo.test.render_test import render_test
     from pettingzoo.utils.conversions import parallel_to_aec
@@ -209,9 +206,6 @@ def test_pettingzoo_finds_nothing_wrong() -> None:
     parallel_api_test(parallel_env(slots=40, **SHORT), num_cycles=100)
     parallel_seed_test(lambda: parallel_env(slots=40, **SHORT), num_cycles=60)
     render_test(lambda render_mode: parallel_to_aec(parallel_env(agents=2, slots=3, render_mode=render_mode)))
-
-
-def test_observations_are_in_their_space_and_the_last_slot_can_be_read() -> None:
     env = parallel_env(render_mode="ansi", **SHORT)
     observations, _ = env.reset()
     assert env.render() == "slot 0 begins"

@@ -250,7 +250,7 @@ def test_a_seed_gives_the_same_bytes_in_every_process(seed: int) -> None:
     assert fly(replace(flight, seed=seed + 1)).hash != fly(flight).hash
 
 
-def test_a_flight_that_fails_is_shrunk_to_a_command() -> None:
+def test_a_flight_or_seed_that_fails_is_shrunk_to_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clocks that drift by a twentieth: nothing can hold the slots together."""
     flight = replace(draw_flight(8), drift_ppm=50_000)
     assert flight.faults
@@ -259,9 +259,6 @@ def test_a_flight_that_fails_is_shrunk_to_a_command() -> None:
     assert simple.faults == () == simple.starts_ns
     assert f"violation='{result.violation}'" in run_command(command_of(simple))
     assert "drift_ppm=50000" in command_of(simple)
-
-
-def test_a_seed_that_fails_is_reported_with_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
     assert live.report_failure(8) == ""
     monkeypatch.setattr(live, "draw_flight", lambda seed: replace(draw_flight(seed), drift_ppm=50_000))
     report = live.report_failure(8)

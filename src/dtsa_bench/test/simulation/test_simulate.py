@@ -71,13 +71,6 @@ def test_slots_that_a_long_frame_would_outlast_are_flown_with_a_table_each() -> 
     assert simulate(config).summary()["age_mean_slots"] == pytest.approx(1.5, abs=0.01)
 
 
-def test_the_same_seed_is_the_same_flight_and_another_seed_another_one() -> None:
-    a, b, c = (fly(agents=8, loss=0.2, seed=seed) for seed in (3, 3, 4))
-    assert plain(a) == plain(b)
-    assert np.array_equal(a.trace.positions(), b.trace.positions())
-    assert not np.array_equal(a.trace.positions()[:100], c.trace.positions()[:100])
-
-
 def test_the_summary_says_what_the_tracks_say() -> None:
     flight = fly(agents=8, moving=4, avoider="potential", slot_ms=30.0, timeout_s=20.0)
     summary, positions = flight.summary(), flight.trace.positions()
@@ -109,7 +102,7 @@ def test_a_crash_ends_the_flight_and_a_timeout_too() -> None:
     assert late["completion_time_s"] is None
 
 
-def test_an_agent_with_a_new_goal_waits_until_it_has_said_so() -> None:
+def test_agents_say_a_new_goal_before_they_fly_and_dtsa_chooses_for_its_reasons() -> None:
     for announce in (True, False):
         flight = fly(agents=6, scenario="staggered", stagger_slots=40, policy="dtsa", announce=announce, timeout_s=6.0)
         path = np.concatenate((flight.scenario.start[None], flight.trace.positions()))
@@ -122,9 +115,6 @@ def test_an_agent_with_a_new_goal_waits_until_it_has_said_so() -> None:
                 assert moved[k] == (said + 1 if announce else begin)
                 waited += said > begin
         assert waited
-
-
-def test_dtsa_chooses_for_the_reasons_that_it_has() -> None:
     flight = fly(agents=12, moving=6, timeout_s=20.0)
     seen = {REASONS[code] for code in flight.trace.reasons}
     assert {"boot", "priority", "tie", "return"} <= seen
