@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 from dtsa_dev.benchmark import core
 from dtsa_dev.registry import main
 
 
-def test_kernels_slots_and_flights_are_rows_of_a_record(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_slots_and_flights_are_rows_of_a_record(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(core, "SIZES", (4,))
     monkeypatch.setattr(core, "FLIGHTS", tuple(({"agents": 4, "policy": "tdma"}, limit) for limit in (1e9, 0, 0, 1e9)))
     assert main(["benchmark", "--parts", "kernels,slots,flights", "--out", str(tmp_path / "speed.json")]) == 0

@@ -53,9 +53,7 @@ def test_help_and_version_need_nothing() -> None:
 
 @pytest.mark.parametrize("command", ["test", "clean", "shell", "setup"])
 @pytest.mark.parametrize("word", ["--help", "-h"])
-def test_help_of_a_command_does_nothing_else(
-    command: str, word: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_of_a_command_does_nothing_else(command, word, monkeypatch, capsys):
     monkeypatch.delattr(checkout, "prepare")
     monkeypatch.delattr(checkout, "lock")
     assert checkout.main([command, word]) == 0
@@ -227,9 +225,7 @@ def test_modules_in_the_current_folder_or_of_another_ros_are_not_seen(foreign: P
 
 
 @pytest.mark.slow
-def test_a_set_up_that_is_interrupted_at_any_moment_is_finished_by_the_same_command(
-    tmp_path: Path, empty: Path
-) -> None:
+def test_a_set_up_that_is_interrupted_at_any_moment_is_finished_by_the_same_command(tmp_path, empty):
     """From nothing, in a path that is neither ASCII nor free of spaces; packages are in uv's cache."""
     place = tmp_path / "Prüfung von außen"
     place.mkdir()

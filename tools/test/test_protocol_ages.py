@@ -64,9 +64,7 @@ def test_all_moving_without_loss_is_exactly_tdma() -> None:
     (12, 12, 600, {"loss": 0.1}, 0.9), (70, 35, 700, {"loss": 0.1}, 0.64), (70, 0, 2000, {"pause": 3000}, 0.8),
     (70, 0, 2000, {"pause": 1000}, 1.02), (70, 0, 2000, {"pause": 300, "loss": 0.1}, 1.02),
 ])  # fmt: skip
-def test_lease_is_younger_than_tdma(
-    agents: int, movers: int, warmup: int, more: dict[str, Any], ceiling: float
-) -> None:
+def test_lease_is_younger_than_tdma(agents, movers, warmup, more, ceiling):
     slots = 8000 if "pause" in more else 4000
     lease, tdma = (run(name, agents, movers, 7, slots, warmup, **more) for name in ("lease", "tdma"))
     assert lease.age < ceiling * tdma.age

@@ -81,9 +81,7 @@ STARTS = [(*radio, loss) for radio in (("sik-64k", 12, 100.0), ("sik-64k", 12, 9
 
 @soak
 @pytest.mark.parametrize(("modem", "agents", "slot_ms", "loss"), STARTS)
-def test_cold_start(
-    modem: str, agents: int, slot_ms: float, loss: float, tmp_path: Path, record: list[list[object]]
-) -> None:
+def test_cold_start(modem, agents, slot_ms, loss, tmp_path, record):
     seed = 1 + STARTS.index((modem, agents, slot_ms, loss))
     found = _fly(tmp_path, modem, agents, slot_ms, loss, 70.0, seed)
     assert found["flight"]["age_mean_slots"] == pytest.approx(found["simulated"]["age_mean_slots"], rel=AGE_MARGIN)

@@ -39,9 +39,7 @@ def test_exit_code_and_arguments_reach_the_command(monkeypatch: pytest.MonkeyPat
     (RemoteProtocolError("frame of agent 3:\n  too short"), 1, "dtsa: error: frame of agent 3: too short\n"),
     (KeyboardInterrupt(), 130, ""),
 ])  # fmt: skip
-def test_an_error_is_one_line_and_an_exit_code(
-    error: BaseException, code: int, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_is_one_line_and_an_exit_code(error, code, said, monkeypatch, capsys):
     fake_command(monkeypatch, MagicMock(side_effect=error))
     assert (cli.main(["probe"]), capsys.readouterr().err.strip()) == (code, said.strip())
 
@@ -53,9 +51,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("words", [["probe", "--slots", "many"], ["probe", "--nothing"], ["nonsense"], []])
-def test_wrong_arguments_are_one_line_and_exit_2(
-    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_arguments_are_one_line_and_exit_2(words, monkeypatch, capsys):
     fake_command(monkeypatch, lambda args: 0)
     assert refused(words, capsys).startswith("dtsa: error: ")
 

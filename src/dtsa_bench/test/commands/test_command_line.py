@@ -111,9 +111,7 @@ def test_progress_says_nothing_of_a_distance_that_was_not_measured() -> None:
 
 
 @pytest.mark.parametrize("command", ["fly", "simulate"])
-def test_auth_without_a_key_leaves_nothing_behind(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_auth_without_a_key_leaves_nothing_behind(command, tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("DTSA_AUTH_KEY", raising=False)
     assert "DTSA_AUTH_KEY" in refused([command, "--auth", "--agents", "3", "--out", str(tmp_path / "a")], capsys)
     assert not list(tmp_path.iterdir())
@@ -121,9 +119,7 @@ def test_auth_without_a_key_leaves_nothing_behind(
 
 @pytest.mark.parametrize("words", [["agent", "--id", "1"], ["sniff"], ["view", "--air", "udp"]])
 @pytest.mark.parametrize("session", [[], ["--auth-session", "0"]])
-def test_sealed_frames_on_a_network_need_a_session(
-    words: list[str], session: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sealed_frames_on_a_network_need_a_session(words, session, capsys, monkeypatch):
     """Else an old flight with the same key could be played again, and be believed."""
     monkeypatch.setenv("DTSA_AUTH_KEY", "7c1f0a93e4d25b6880b13f96c2de470a")
     assert "auth_session: got 0; allowed: 1 to" in refused([*words, "--interface", "lo", *session], capsys)

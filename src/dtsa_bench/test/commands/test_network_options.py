@@ -75,9 +75,7 @@ def test_an_error_names_file_and_setting(tmp_path: Path, line: str, field: str, 
 
 
 @pytest.mark.parametrize("content", [None, b"\xff\xfe", b"a: [", b"- 1"])
-def test_a_file_that_holds_no_settings_is_named(
-    tmp_path: Path, content: bytes | None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_holds_no_settings_is_named(tmp_path, content, capsys):
     path = tmp_path / "swarm.yaml"
     if content is not None:
         path.write_bytes(content)

@@ -115,9 +115,7 @@ def launched(monkeypatch: pytest.MonkeyPatch, **arguments: str) -> list[SimpleNa
     return found
 
 
-def test_ctrl_c_in_a_launch_lands_simulated_ones_before_they_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_in_a_launch_lands_simulated_ones_before_they_end(tmp_path, monkeypatch):
     config = swarm_yaml(tmp_path, "udp://127.0.0.1:{}", free_base_port(2))
     words = {"config": str(config), "simulated": "true", "mission": "false", "interfaces": "dtsa"}
     simulated, node = launched(monkeypatch, **words)
@@ -229,9 +227,7 @@ def test_killed_it_takes_the_simulated_ones_along(tmp_path: Path) -> None:
         wait_for(lambda: gone(fleet))
 
 
-def test_simulated_ones_take_other_ports_where_others_have_just_taken_theirs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_simulated_ones_take_other_ports_where_others_have_just_taken_theirs(tmp_path, monkeypatch):
     taken = free_base_port(3)
     found = iter((taken, taken + 1, taken + 1))  # free, not free any more, others
     monkeypatch.setattr(simulated_process, "free_base_port", lambda count, first=None: next(found))

@@ -203,9 +203,7 @@ def test_the_app_compiles_for_its_microcontroller_without_a_warning(tmp_path: Pa
     assert ram < 20_000, sizes
 
 
-def test_the_command_flies_the_protocol_and_says_what_cannot_be(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_flies_the_protocol_and_says_what_cannot_be(tmp_path, capsys):
     short = ["peer-lab", "protocol", "--agents", "3", "--seconds", "7", "--out", str(tmp_path / "flight")]
     assert main([*short, "--policy", "tdma"]) == 0
     assert "digest" in capsys.readouterr().out

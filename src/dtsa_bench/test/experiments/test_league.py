@@ -85,9 +85,7 @@ def test_any_changed_value_is_found_and_named(flown: Path, capsys: pytest.Captur
         assert "lease: 4 of 4 flights flown again; 1 differences" in text
 
 
-def test_a_plug_in_in_a_directory_of_its_own_enters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_plug_in_in_a_directory_of_its_own_enters(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setenv("PYTHONPATH", "")
     target = tmp_path / "installed"
@@ -119,9 +117,7 @@ def test_wrong_input_is_refused_in_one_line(words: list[str], said: str, capsys:
     assert said in refused(["league", *words], capsys)
 
 
-def test_an_entry_of_a_policy_that_is_not_here_is_not_checked(
-    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_entry_of_a_policy_that_is_not_here_is_not_checked(flown, tmp_path, capsys):
     text = (flown / "lease" / "entry.json").read_text().replace('"policy": "lease"', '"policy": "moon"')
     (tmp_path / "entry.json").write_text(text)
     assert cli.main(["league", "check", str(tmp_path)]) == 1

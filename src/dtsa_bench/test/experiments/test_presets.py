@@ -132,9 +132,7 @@ def test_every_preset_ends_in_a_report_that_needs_no_network(name: str, tmp_path
 
 
 @pytest.mark.parametrize("names", ["paper-12,nope", "protocol,paper-12"])
-def test_presets_that_cannot_be_swept_are_refused_before_anything_is_flown(
-    names: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_presets_that_cannot_be_swept_are_refused_before_anything_is_flown(names, tmp_path, capsys):
     assert cli.main(["sweep", "--preset", names, "--out", str(tmp_path)]) == 2
     assert "paper-12, paper-18" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

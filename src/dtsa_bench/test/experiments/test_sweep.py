@@ -121,9 +121,7 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.Mo
     assert not flown
 
 
-def test_rows_of_other_code_and_of_other_sweeps_are_never_mixed_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_of_other_code_and_of_other_sweeps_are_never_mixed_in(tmp_path, monkeypatch):
     plan = sweep(seeds=1)
     whole = stable(fly(tmp_path, plan).rows)
     with monkeypatch.context() as patched:
@@ -232,9 +230,7 @@ def test_the_command_writes_everything(tmp_path: Path, capsys: pytest.CaptureFix
     (["--preset", "idle", "--set", "loss=2"], "loss"),
     (["--preset", "estimate", "--cluster", "tcp://127.0.0.1:1"], "cluster"), ([], ""),
 ])  # fmt: skip
-def test_wrong_words_end_with_one_line_and_code_2(
-    words: list[str], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_words_end_with_one_line_and_code_2(words, field, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(batch, "PATIENCE_S", 1.0)
     if field == "cluster":
         pytest.importorskip("distributed")
@@ -330,9 +326,7 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]
             process.wait()
 
 
-def test_a_worker_of_a_cluster_that_dies_costs_no_result(
-    cluster: tuple[str, list[subprocess.Popen[bytes]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_of_a_cluster_that_dies_costs_no_result(cluster, tmp_path, monkeypatch):
     from distributed import Client
 
     address, workers = cluster

@@ -68,9 +68,7 @@ def panels(node: Any) -> list[str]:
     return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
 
 
-def test_files_are_what_the_script_writes_and_grow_again_from_fewer_agents(
-    make: ModuleType, tmp_path, monkeypatch
-) -> None:
+def test_files_are_what_the_script_writes_and_grow_again_from_fewer_agents(make, tmp_path, monkeypatch):
     assert make.FOXGLOVE.read_text(encoding="utf-8") == make.foxglove()
     assert make.PLOTJUGGLER.read_text(encoding="utf-8") == make.plotjuggler()
     wanted = make.foxglove(), make.plotjuggler()

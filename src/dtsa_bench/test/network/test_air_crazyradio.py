@@ -166,9 +166,7 @@ def test_a_dongle_that_goes_and_is_back_is_said_and_flies_on(tmp_path: Path) -> 
     ([], "uri"),
     (["--uri", "radio://0/80/2M", "--interface", "lo"], "interface: got 'lo'; allowed: one of the settings"),
 ])  # fmt: skip
-def test_bad_input_is_one_line(
-    tmp_path_factory: pytest.TempPathFactory, capsys: pytest.CaptureFixture[str], words: list[str], line: str
-) -> None:
+def test_bad_input_is_one_line(tmp_path_factory, capsys, words, line):
     radio = tmp_path_factory.mktemp("bad") / "radio"
     with dongles(radio, "--radio-dongles", "1"):
         command = ["agent", "--air", "crazyradio", "--simulated-radio", str(radio), "--id", "1", "--agents", "2"]

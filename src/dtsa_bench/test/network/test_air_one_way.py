@@ -50,9 +50,7 @@ def _merged(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int
     return code, json.loads(said.out) if said.out else {}, said.err
 
 
-def test_between_groups_that_hear_one_way_no_offset_is_made_up(
-    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_between_groups_that_hear_one_way_no_offset_is_made_up(bags, tmp_path, capsys):
     code, found, said = _merged(capsys, *bags, "--out", tmp_path / "whole")
     assert code == 1
     assert found["not_determined"] == [["cf1", "cf2"], ["cf3"]]
@@ -67,9 +65,7 @@ def test_between_groups_that_hear_one_way_no_offset_is_made_up(
     assert any("the others: cf3." in note for note in run_data(tmp_path / "whole")["notes"])
 
 
-def test_two_agents_of_which_one_is_deaf_have_no_time_line(
-    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_agents_of_which_one_is_deaf_have_no_time_line(bags, tmp_path, capsys):
     code, found, said = _merged(capsys, bags[0], bags[2])
     assert code == 1
     assert found["not_determined"] == [["cf1"], ["cf3"]]
@@ -83,9 +79,7 @@ def test_two_agents_of_which_one_is_deaf_have_no_time_line(
     assert not (tmp_path / "whole").exists()
 
 
-def test_an_agent_that_wrote_nothing_is_named_and_the_others_are_merged(
-    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_agent_that_wrote_nothing_is_named_and_the_others_are_merged(bags, tmp_path, capsys):
     empty, killed = tmp_path / "cf3", tmp_path / "killed"
     empty.mkdir()
     killed.mkdir()
@@ -106,9 +100,7 @@ def test_an_agent_that_wrote_nothing_is_named_and_the_others_are_merged(
         assert (code, said.count("\n")) == (2, 1)
 
 
-def test_frames_of_a_process_that_wrote_nothing_are_no_lies(
-    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_of_a_process_that_wrote_nothing_are_no_lies(bags, tmp_path, capsys):
     """cf2 was killed before it wrote, and its frames were heard; then it came back, and was heard, too."""
     later = read(bags[1])
     middle = later.slots[len(later.slots) // 2].slot

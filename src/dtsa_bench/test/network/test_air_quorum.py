@@ -31,9 +31,7 @@ def flying(groups: tuple[str, str], directory: Path) -> AbstractContextManager[l
 
 
 @pytest.mark.parametrize("deaf", [True, False])
-def test_an_agent_whose_frames_are_lost_one_way_hovers_in_flight_and_flies_on_when_they_come(
-    groups: tuple[str, str], tmp_path: Path, deaf: bool
-) -> None:
+def test_an_agent_whose_frames_are_lost_one_way_hovers_in_flight_and_flies_on_when_they_come(groups, tmp_path, deaf):
     link = helpers.Carrier(*groups)
     try:
         with flying(groups, tmp_path) as agents:
@@ -85,9 +83,7 @@ def test_an_agent_that_nobody_has_heard_does_not_begin_to_fly(groups: tuple[str,
 
 
 @pytest.mark.parametrize(("quorum", "flies"), [("0", True), ("all-but-one", False), ("1", False)])
-def test_an_agent_that_is_alone_flies_only_where_nobody_has_to_be_there(
-    groups: tuple[str, str], tmp_path: Path, quorum: str, flies: bool
-) -> None:
+def test_an_agent_that_is_alone_flies_only_where_nobody_has_to_be_there(groups, tmp_path, quorum, flies):
     udp = UdpSettings(interface="lo", group=groups[0])
     with helpers.flying(CONFIG, [udp], tmp_path, lambda _: {"quorum": quorum}) as (alone,):
         if flies:

@@ -191,9 +191,7 @@ def test_slots_that_are_too_short_are_refused_before_anything_is_made(capsys: py
     assert "slot_ms: got 20.0; allowed: at least" in capsys.readouterr().err
 
 
-def test_a_device_that_may_not_be_opened_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_device_that_may_not_be_opened_is_named(monkeypatch, capsys):
     def refused(*words: object, **more: object) -> None:  # root may open every device
         raise serial.SerialException(errno.EACCES, "could not open port")
 

@@ -267,9 +267,7 @@ def test_verify_finds_what_was_changed_in_a_merged_bag(flight: Flight, tmp_path:
     assert (difference.what, difference.slot, difference.agent) == ("report.chosen", liar.slot, 2)
 
 
-def test_merge_keeps_the_whole_flight_or_nothing(
-    flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_merge_keeps_the_whole_flight_or_nothing(flight, tmp_path, monkeypatch, capsys):
     """Of a bag that breaks off what is whole is kept, and nothing is made up for the rest."""
     cut = tmp_path / "cf1.mcap"
     cut.write_bytes(flight.bags[0].read_bytes()[: flight.bags[0].stat().st_size * 2 // 3])
@@ -295,9 +293,7 @@ def test_merge_keeps_the_whole_flight_or_nothing(
 
 
 @pytest.mark.parametrize("command", ["verify", "report", "export"])
-def test_commands_for_other_bags_say_what_is_meant_for_these(
-    flight: Flight, command: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_for_other_bags_say_what_is_meant_for_these(flight, command, capsys):
     assert main([command, str(flight.bags[0])]) == 2
     said = capsys.readouterr().err
     assert "`tools/dtsa merge`" in said

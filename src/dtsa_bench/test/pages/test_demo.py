@@ -84,9 +84,7 @@ def test_death_new_use_and_return_are_found(flights: dict[str, FinishedFlight]) 
     assert "speaks 7.2 s later" in step_text(4, flights)[1]
 
 
-def test_picture_has_all_colours_and_animation_is_small_and_moves(
-    flights: dict[str, FinishedFlight], tmp_path: Path
-) -> None:
+def test_picture_has_all_colours_and_animation_is_small_and_moves(flights, tmp_path):
     draw_demo(tmp_path / "demo.png", STEPS, flights)
     with Image.open(tmp_path / "demo.png") as picture:
         assert picture.width > 1600

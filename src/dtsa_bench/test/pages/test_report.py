@@ -47,9 +47,7 @@ def data(flights: dict[str, Path]) -> dict[str, Any]:
     return {name: run_data(path) for name, path in flights.items()}
 
 
-def test_everything_that_reads_a_run_takes_its_directory_its_bag_and_its_file(
-    flights: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_everything_that_reads_a_run_takes_its_directory_its_bag_and_its_file(flights, tmp_path, capsys):
     shutil.copytree(flights["clean"], tmp_path / "a" / "bag")
     file = next((tmp_path / "a" / "bag").glob("*.mcap"))
     known = load_run(file)
@@ -65,9 +63,7 @@ def test_everything_that_reads_a_run_takes_its_directory_its_bag_and_its_file(
     capsys.readouterr()
 
 
-def test_results_of_a_run_directory_stay_in_it(
-    flights: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_of_a_run_directory_stay_in_it(flights, tmp_path, capsys):
     run = tmp_path / "a"
     shutil.copytree(flights["clean"], run / "bag")
     assert main(["report", str(run)]) == main(["export", str(run)]) == main(["recover", str(run)]) == 0
@@ -188,9 +184,7 @@ def hostile(data: dict[str, Any]) -> dict[str, Any]:
     return {**data["clean"], "name": evil, "config": [["swarm", evil, evil]], "notes": [evil]}
 
 
-def test_the_page_fetches_nothing_and_names_and_settings_cannot_break_out(
-    data: dict[str, Any], hostile: dict[str, Any]
-) -> None:
+def test_the_page_fetches_nothing_and_names_and_settings_cannot_break_out(data, hostile):
     for page in (render([data["clean"], data["lossy"]]), render([hostile])):
         shown = re.sub(r"<script.*?</script>", "", page, flags=re.S)
         assert not re.search(r"<(link|img|iframe|object|embed|base)\b|<[^>]* (src|href|srcset|data)=", shown)
@@ -266,9 +260,7 @@ def drawn(browser: Browser, runs: list[dict[str, Any]], directory: Path, script:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
-def test_chromium_draws_every_part_and_shows_hostile_names_as_text(
-    data: dict[str, Any], hostile: dict[str, Any], tmp_path: Path
-) -> None:
+def test_chromium_draws_every_part_and_shows_hostile_names_as_text(data, hostile, tmp_path):
     with browsing() as browser:
         shown = drawn(browser, [hostile, data["lossy"]], tmp_path)
         assert "<title>broken" not in shown
@@ -292,9 +284,7 @@ const waits = setInterval(() => {  // a busy machine may draw nothing for a whil
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
-def test_chromium_plays_on_from_where_it_stood_marks_crashes_and_prints(
-    crash: tuple[dict[str, Any], Path], tmp_path: Path
-) -> None:
+def test_chromium_plays_on_from_where_it_stood_marks_crashes_and_prints(crash, tmp_path):
     data, _ = crash
     with browsing() as browser:
         shown = drawn(browser, [data], tmp_path, PLAY)

@@ -150,9 +150,7 @@ def test_the_new_bag_knows_the_run_and_where_it_comes_from(run: SyntheticRun, tm
             assert topic.definition == before.definition
 
 
-def test_a_whole_bag_is_copied_what_is_missing_is_counted_and_what_is_there_stays(
-    run: SyntheticRun, tmp_path: Path
-) -> None:
+def test_a_whole_bag_is_copied_what_is_missing_is_counted_and_what_is_there_stays(run, tmp_path):
     result = recover(run.writer.directory, tmp_path / "new")
     assert result.closed
     assert result.damaged == []

@@ -127,9 +127,7 @@ def test_pairs_of_a_flight_without_losses_have_all_observers(tmp_path: Path) -> 
     assert sorted(ages["observers"]) == [0, 0, 3, 3]
 
 
-def test_units_are_in_the_files_and_tables_larger_than_a_batch_are_whole(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_units_are_in_the_files_and_tables_larger_than_a_batch_are_whole(flight, tmp_path, monkeypatch):
     export(flight, tmp_path / "tables", tables=["states"])
     assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["columns.md", "states.parquet"]
     schema = pyarrow.parquet.read_schema(tmp_path / "tables" / "states.parquet")
