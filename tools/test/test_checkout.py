@@ -68,7 +68,7 @@ def test_wrong_words_are_one_line_and_exit_2(words: list[str]) -> None:
     assert result.stderr.count("\n") == 1
 
 
-def test_the_version_is_the_same_everywhere() -> None:
+def test_the_version_is_the_same_everywhere_and_all_that_is_wanted_is_pinned() -> None:
     found = {path: ElementTree.parse(path).findtext("version") for path in checkout.ROOT.glob("src/*/package.xml")}
     assert len(found) == 4
     text = (checkout.ROOT / "CITATION.cff").read_text(encoding="utf-8")
@@ -76,9 +76,6 @@ def test_the_version_is_the_same_everywhere() -> None:
         *found.values(), *re.findall(r"^version: (.*)$", text, re.MULTILINE), importlib.metadata.version("dtsa"),
     }  # fmt: skip
     assert versions == {dtsa_bench.__version__}
-
-
-def test_all_that_is_wanted_is_pinned_with_hashes() -> None:
     pins = re.findall(r"(?m)^(\S+)==(\S+)(.*)((?:\n +--hash.*)*)", (checkout.ROOT / "requirements.txt").read_text())
     assert all("--hash=sha256:" in hashes for *_, hashes in pins)
     names = {name.partition("[")[0] for name, *_ in pins}
@@ -119,16 +116,13 @@ def test_missing_headers_and_venv_are_named(empty: Path, monkeypatch: pytest.Mon
         checkout.check_system()
 
 
-def test_an_environment_that_somebody_else_made_is_left_alone(empty: Path) -> None:
+def test_the_environment_of_others_is_left_alone_and_another_python_has_its_own(empty: Path) -> None:
     (empty / ".venv/bin").mkdir(parents=True)
     (empty / ".venv/bin/python").symlink_to("/root/of/somebody/else/python3")
     result = call("simulate", tool=empty / "tools/dtsa")
     assert result.returncode == 2
     assert ".venv was not made by tools/dtsa" in result.stderr
     assert result.stderr.count("\n") == 1
-
-
-def test_another_python_has_an_environment_of_its_own() -> None:
     program = "import checkout; print(checkout.VENV.name)"
     environment = {**os.environ, "PYTHONPATH": str(DTSA.parent), "DTSA_PYTHON": sys.executable}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)

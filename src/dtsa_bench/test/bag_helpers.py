@@ -166,6 +166,16 @@ def synthetic_bag(directory: Path, slots: int = 100, **options: Any) -> Syntheti
     return run
 
 
+def flight_bag(directory: Path, slots: int = 400, loss: float = 0.0, **settings: Any) -> None:
+    """Fly and record a number of slots with fields of `SwarmConfig`; a receiver loses a frame with a probability."""
+    run = SyntheticRun(directory, SwarmConfig(**settings), loss, whole=False)
+    with run.writer:
+        for slot in range(slots):
+            run.slot(slot)
+        # The last slot is answered too: with it the agents say where they are at its end.
+        run.answer(slots, np.zeros(0, np.uint8))
+
+
 _HELD = ExitStack()
 atexit.register(_HELD.close)
 

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from flight_helpers import flight_bag
+from bag_helpers import flight_bag
 
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
 from dtsa_bench.pages.view.follower import Follower

@@ -81,7 +81,7 @@ def test_a_full_disk_behind_standard_output_is_one_line(words: list[str]) -> Non
     assert (done.returncode, done.stderr) == (1, said)
 
 
-def test_no_command_module_is_forgotten() -> None:
+def test_no_command_module_is_forgotten_and_help_imports_nothing_heavy() -> None:
     from importlib.resources import files
 
     package = "dtsa_bench.commands"
@@ -91,10 +91,7 @@ def test_no_command_module_is_forgotten() -> None:
         if file.name.endswith(".py") and "EXAMPLES = (" in file.read_text()
     }
     assert found == {name for name in map(registry.module_of, registry.COMMANDS) if name.startswith(package)}
-
-
-def test_help_imports_nothing_heavy() -> None:
-    """That of the list of commands, and of commands that read runs."""
+    # That of the list of commands, and of commands that read runs.
     script = (
         "import sys; from dtsa_bench.commands.cli import build_parser; "
         "[build_parser(name) for name in (None, 'verify', 'report', 'replay', 'recover', 'export', 'sweep')]; "

@@ -92,17 +92,6 @@ def completions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_completion_knows_every_command_and_option(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["completion", "zsh"]) == 0
-    text = capsys.readouterr().out
-    assert text.startswith("#compdef dtsa")
-    assert set(OF_THE_TOOL) == set(checkout.COMMANDS)
-    assert all(f"    {command}:'" in text for command in (*COMMANDS, *OF_THE_TOOL))
-    for command in COMMANDS:
-        options = {o for action in parser_of(command)._actions for o in action.option_strings if o.startswith("--")}
-        assert all(option in text for option in options), command
-
-
 def test_progress_says_nothing_of_a_distance_that_was_not_measured() -> None:
     """Before the first slot is over there is no pair, however many agents there are."""
     assert "closest" not in flight_text(0, 0.0, 0.1, 0.0, (0, 0))
@@ -125,10 +114,20 @@ def test_sealed_frames_on_a_network_need_a_session(words, session, capsys, monke
     assert "auth_session: got 0; allowed: 1 to" in refused([*words, "--interface", "lo", *session], capsys)
 
 
-def test_what_prints_results_prints_them_as_json() -> None:
+def test_completion_knows_every_command_and_option_and_results_are_printed_as_json(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     for command in ("demo", "fly", "simulate", "sweep", "verify", "recover", "export"):
         parser = parser_of(command)
         assert any("--json" in action.option_strings for action in parser._actions), command
+    assert cli.main(["completion", "zsh"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("#compdef dtsa")
+    assert set(OF_THE_TOOL) == set(checkout.COMMANDS)
+    assert all(f"    {command}:'" in text for command in (*COMMANDS, *OF_THE_TOOL))
+    for command in COMMANDS:
+        options = {o for action in parser_of(command)._actions for o in action.option_strings if o.startswith("--")}
+        assert all(option in text for option in options), command
 
 
 def test_simulate_draws_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

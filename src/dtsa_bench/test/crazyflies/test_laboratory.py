@@ -231,7 +231,7 @@ void appMain(void) {
 }"""
 
 
-def test_a_frame_takes_its_time_on_both_lines_and_on_the_air(write) -> None:
+def test_frames_take_their_time_and_meet_on_the_air(write) -> None:
     place = write(SENDER.replace("BODY", "if (id == 1) radiolinkSendP2PPacketBroadcast(&packet);"))
     with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.0)) as lab:
         lab.run(0.1)
@@ -241,17 +241,11 @@ def test_a_frame_takes_its_time_on_both_lines_and_on_the_air(write) -> None:
     way_us = (line.to_radio_ns(20) + line.from_radio_ns(20)) / 1000 + on_air_us
     assert (size, sender) == (20, 1)
     assert 10_000 + way_us <= heard_us <= 10_000 + way_us + 10  # and a few calls
-
-
-def test_who_sends_hears_nothing_and_two_at_a_time_destroy_each_other(write) -> None:
     place = write(SENDER.replace("BODY", "if (id < 3) radiolinkSendP2PPacketBroadcast(&packet);"))
     with Laboratory(read_app(place), LabSettings(agents=3, boot_s=0.0)) as lab:
         lab.run(0.1)
         assert sum(lab.record.sent) == 2
         assert lab.record.heard == [0, 0, 0]
-
-
-def test_a_send_cuts_a_reception_at_its_sender_alone(write) -> None:
     # Vehicle 2 turns to sending while the frame of 1 ends: 3 has it, as nothing of 2 is on the air yet.
     wait = "if (id == 1) radiolinkSendP2PPacketBroadcast(&packet); if (id == 2) { peerLabSpend(150);"
     place = write(SENDER.replace("BODY", wait + " radiolinkSendP2PPacketBroadcast(&packet); }"))

@@ -176,9 +176,6 @@ def test_the_order_is_by_lost_flights_times_age_and_bounds_have_no_rank() -> Non
         ["1", "none lost"], ["2", "none lost, slow"], ["3", "slow"], ["4", "many lost"], ["bound", "all-knowing"],
     ]  # fmt: skip
     assert table.lines() == LeagueTable(LEAGUE, entries[::-1]).lines()
-
-
-def test_a_lost_flight_counts_with_the_cells_age() -> None:
     found = scores(LEAGUE, made_up("x", [50.0, 5000.0, 200.0], crashed=1)["flights"])
     assert found.lost.count == 1
     assert found.age_ms[0] == pytest.approx((1200 * 1200 * 200) ** (1 / 3))  # a larger age counts no more than that

@@ -111,15 +111,14 @@ def test_the_terminal_shows_every_interval_whatever_its_width(table: SweepTable)
     assert sorted(set(narrow.split())) == sorted(set(wide.split()))
 
 
-def test_measures_that_no_flight_has_take_no_column() -> None:
+def test_measures_that_no_flight_has_take_no_column_and_intervals_a_line(
+    table: SweepTable, swept: dtsa.SweepResult
+) -> None:
     plan = make_sweep({"axes": {"loss": [0.0]}, "base": {**BASE, "timeout_s": 0.3}, "seeds": 2}, "short")
     short = SweepTable(plan, run_all(plan.batch))
     assert "age slots" in table_text(short)
     assert "dist m" not in table_text(short)  # of completed flights alone
     assert set(SHOWN) <= set(MEASURES)
-
-
-def test_notebooks_show_a_table_with_a_line_for_each_interval(table: SweepTable, swept: dtsa.SweepResult) -> None:
     page = ElementTree.fromstring(table_html(table))
     assert len(page.findall(".//tr")) == 5
     assert len(page.findall(".//svg")) == 4 * (1 + len(SHOWN))

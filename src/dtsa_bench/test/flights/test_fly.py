@@ -159,7 +159,9 @@ def test_after_a_signal_no_process_is_started(tmp_path: Path, monkeypatch: pytes
     assert list((tmp_path / "out" / "log").iterdir()) == []
 
 
-def test_variables_of_a_shell_that_would_keep_processes_apart_do_not_count(capsys: pytest.CaptureFixture[str]) -> None:
+def test_variables_of_a_shell_and_modules_in_its_folder_do_not_reach_agents(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shell = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "ROS_DISCOVERY_SERVER": "a:1", RANGE: "OFF", "HOME": "/"}
     clear_hindrances(shell)
     assert shell == {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", RANGE: "LOCALHOST", "HOME": "/"}
@@ -167,9 +169,6 @@ def test_variables_of_a_shell_that_would_keep_processes_apart_do_not_count(capsy
     assert said == ["dtsa: RMW_IMPLEMENTATION", "dtsa: ROS_DISCOVERY_SERVER", f"dtsa: {RANGE}"]
     clear_hindrances(shell)
     assert not capsys.readouterr().err
-
-
-def test_modules_in_the_current_folder_are_not_those_of_agents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "numpy.py").write_text("raise RuntimeError('not NumPy')")
     monkeypatch.chdir(tmp_path)
     children = Children(tmp_path, {})

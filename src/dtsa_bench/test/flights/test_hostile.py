@@ -190,9 +190,6 @@ def test_messages_of_every_kind_end_and_freeze_nobody_in_real_time_and_are_not_b
     assert not [data for data in forged if any(data in message for message in sent)]
 
 
-# -- the handshake
-
-
 @pytest.mark.parametrize(("second", "said"), [
     ("seed:=7", r"seed of /cf[12]/agent: got [17]; allowed: [17], as /cf[12]/agent has it"),
     ("slot_ms:=20", r"slot_ms of /cf2/agent: got 20\.0; allowed: 10\.0, as /swarm/channel has it"),

@@ -103,9 +103,6 @@ def test_the_clock_on_the_wall_ends_a_flight(tmp_path: Path, mode: str) -> None:
     assert "longer than 3 s" in summary_of(flight.out)["cut_short"]
 
 
-# Without nodes.
-
-
 def test_completed_and_crashed_are_never_one_line() -> None:
     summary: dict[str, Any] = {
         "agents": 2, "moving": 2, "policy": "dtsa", "estimator": "linear", "avoider": "orca", "end": "completed",

@@ -223,10 +223,7 @@ def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) 
     assert (summary["end"], summary["returned_agents"]) == ("completed", [1, 2])
 
 
-# Without nodes.
-
-
-def test_who_is_back_counts_again() -> None:
+def test_who_is_back_counts_again_and_who_flies_into_a_dead_agents_vehicle_has_crashed() -> None:
     config = SwarmConfig(agents=4, moving=4, slot_ms=100.0)
     scenario = make_scenario(config)
     metrics = FlightMetrics(RunConfig(config, limits=RunLimits(tail_s=0.0, timeout_s=30.0)), scenario)
@@ -263,9 +260,6 @@ def test_who_is_back_counts_again() -> None:
     fly(elsewhere)
     assert metrics.crash_slot > 0
     assert metrics.collided_pair == (1, 2)
-
-
-def test_who_flies_into_a_dead_agents_vehicle_has_crashed() -> None:
     config = SwarmConfig(agents=4, moving=4, slot_ms=100.0)
     scenario = make_scenario(config)
     metrics = FlightMetrics(RunConfig(config), scenario)

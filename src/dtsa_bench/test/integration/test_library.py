@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from flight_helpers import flight_bag
+from bag_helpers import flight_bag
 
 import dtsa
 from dtsa_bench.runs.config import RunConfig

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from flight_helpers import flight_bag
+from bag_helpers import flight_bag
 from matplotlib.figure import Figure
 
 from dtsa import _plots

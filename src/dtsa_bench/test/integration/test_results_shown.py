@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from flight_helpers import flight_bag
+from bag_helpers import flight_bag
 
 import dtsa
 from dtsa_bench.drawing.card import as_html
@@ -52,7 +52,7 @@ def test_flights_show_their_results_and_a_picture() -> None:
     assert "<svg" not in dtsa.simulate(**settings, trace=False)._repr_html_()
 
 
-def test_flights_and_sweeps_can_be_pickled() -> None:
+def test_flights_and_sweeps_can_be_pickled_and_shown_without_plots_and_tables() -> None:
     flight = dtsa.simulate(agents=4, loss=0.1, timeout_s=0.5)
     copy = pickle.loads(pickle.dumps(flight))
     assert np.array_equal(copy.path, flight.path)
@@ -60,9 +60,6 @@ def test_flights_and_sweeps_can_be_pickled() -> None:
     assert repr(copy) == repr(flight)
     result = dtsa.sweep(axes={"loss": [0.0, 0.2]}, base={"agents": 4, "timeout_s": 0.3}, seeds=2)
     assert pickle.loads(pickle.dumps(result)).table().equals(result.table())
-
-
-def test_showing_a_flight_loads_no_plots_and_no_tables() -> None:
     program = (
         "import sys, dtsa; f = dtsa.simulate(agents=4, timeout_s=0.3); repr(f); "
         "print([name for name in ('matplotlib', 'pandas', 'pyarrow', 'rich') if name in sys.modules])"
@@ -85,7 +82,7 @@ def test_configurations_show_what_differs_from_the_defaults_and_can_be_read_back
     assert repr(dtsa.SwarmConfig(moving=2, slot_ms=20)) == "SwarmConfig(moving=2, slot_ms=20.0)"
 
 
-def test_recordings_and_verifications_are_shown_and_what_is_shown_is_escaped(tmp_path: Path) -> None:
+def test_recordings_and_verifications_are_shown_and_escaped_also_where_positions_are_unknown(tmp_path: Path) -> None:
     run = tmp_path / "a & <b>"
     flight_bag(run / "bag", slots=60, loss=0.1, agents=6, policy="lease", seed=3)
     recording, verification = dtsa.read_bag(run), dtsa.verify(run)
@@ -96,9 +93,6 @@ def test_recordings_and_verifications_are_shown_and_what_is_shown_is_escaped(tmp
     assert not [shown for shown in (recording, verification) if "<b>" in shown._repr_html_()]
     page = as_html("a < b", [("x & y", "<i>")], folded=[("<u>", [("p", "<q>")])])
     assert not [word for word in ("a < b", "<i>", "<u>", "<q>", "x & y") if word in page]
-
-
-def test_positions_may_be_unknown() -> None:
     path = np.full((5, 3, 3), np.nan)
     path[2:, :, 0] = 1.0
     assert count(svg_from_above(path, np.array([True, True, False]), "<a>", (1, 2))) == [1, 0]

@@ -28,7 +28,6 @@ from dtsa_channel_sim import ChannelConfig, ClockConfig
 MANY = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
 
 
-# -- any values that the settings allow ------------------------------------------------------------------------------
 def value_of(spec: Setting) -> st.SearchStrategy[Any]:
     if spec.choices:
         return st.sampled_from(spec.choices)
@@ -110,7 +109,6 @@ def ways(values: dict[str, Any], sort: bool = True) -> Iterator[dict[str, Any]]:
     yield yaml.safe_load(yaml.safe_dump(values, sort_keys=sort))
 
 
-# -- round trips -----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "cls",
     [SwarmConfig, ChannelConfig, ClockConfig, RunLimits, RunConfig, AvoiderParams, VehicleParams, SafetySettings,
@@ -184,7 +182,6 @@ def test_bags_of_before_are_read() -> None:
     assert isinstance(run.swarm.slot_ms, float)
 
 
-# -- the framework ---------------------------------------------------------------------------------------------------
 def words() -> tuple[str, ...]:
     return ("red", "green")
 
@@ -250,7 +247,6 @@ def test_texts_are_read(name: str, text: str, value: Any) -> None:
         spec.read("maybe")
 
 
-# -- axes and columns ------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("axis", ["cell", "status", "seed", "collided", "runs", "crashed", "age_mean_slots"])
 def test_axes_are_not_called_like_columns_of_the_results(axis: str) -> None:
     with pytest.raises(ConfigError) as caught:

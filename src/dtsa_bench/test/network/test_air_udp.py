@@ -167,7 +167,7 @@ def test_a_page_is_told_what_a_listener_heard(flight: Flight) -> None:
     assert (last["tables"], last["agree"]) == (0, [0, 0])
 
 
-def test_a_bag_that_lies_is_found(flight: Flight) -> None:
+def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: Flight, tmp_path: Path) -> None:
     bags = [read(path) for path in flight.bags]
     said = bags[0].slots[-20]
     said.chosen = 4 if said.chosen != 4 else 1
@@ -180,68 +180,6 @@ def test_a_bag_that_lies_is_found(flight: Flight) -> None:
     spoken = next(record for record in bags[1].slots[-60:] if record.datagram)
     spoken.datagram = spoken.datagram[:-5] + bytes([spoken.datagram[-5] ^ 1]) + spoken.datagram[-4:]
     assert Merge(bags).judge()["frames_heard_not_as_sent"] > 0
-
-
-def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> None:
-    whole = flight.bags[0].read_bytes()
-    cut = tmp_path / "cf1.mcap"
-    cut.write_bytes(whole[: len(whole) * 2 // 3])
-    bag = read(cut)
-    assert bag.broken_off
-    assert 0 < len(bag.slots) < len(read(flight.bags[0]).slots)
-    found = Merge([bag, *(read(path) for path in flight.bags[1:])]).judge()
-    assert found["broken_off"] == ["cf1"]
-    assert verified(found)
-    for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
-        cut.write_bytes(bad)
-        with pytest.raises(DtsaError):
-            Merge([read(cut)]).judge()
-
-
-def test_a_merged_flight_is_kept_as_a_bag_like_others(flight: Flight) -> None:
-    found, run = flight.merged["flight"], dtsa.read_bag(flight.whole)
-    assert json.loads((flight.whole / "summary.json").read_text())["flight"] == found
-    assert "channel_load" not in found  # nobody knows how long this network's frames are on the air
-    assert run.summary == found
-    seen = run.ages_by_observer[run.ages_by_observer.counted]
-    assert seen.age_slots.mean() == pytest.approx(found["age_mean_slots"], rel=1e-12)
-    assert seen.error_m.max() == found["estimate_error_max_m"]
-    page = run_data(flight.whole)
-    assert page["summary"]["age_mean_slots"] == found["age_mean_slots"]
-    assert page["slots"]["count"] == len(run.slots)
-    assert page["distances"]["time"]
-    with Reader(flight.whole / "bag") as foreign:  # rosbag2's metadata, and every message, by an independent reader
-        assert foreign.message_count == sum(1 for _ in foreign.messages())
-        assert {"/swarm/frame", "/swarm/reception", "/cf1/odom"} <= foreign.topics.keys()
-    with Bag(flight.whole) as bag:
-        said: dict[str, list[Any]] = {}
-        for message, decoded in bag.typed():
-            said.setdefault(message.topic, []).append(decoded)
-    pictures = [[(one.action, one.id) for one in picture.markers] for picture in said["/swarm/markers"]]
-    assert pictures[0] == [(3, 0)]  # DELETEALL: who vanishes is not left standing
-    assert {agent for picture in pictures for action, agent in picture if action == 0} == {1, 2, 3}
-    assert said["/swarm/status"][0].lost.tolist() == [4]
-    assert said["/swarm/status"][-1].reason == "merged from 3 agents' bags"
-
-
-def test_of_an_agent_without_a_bag_nothing_is_known(flight: Flight) -> None:
-    run = dtsa.read_bag(flight.whole)
-    assert set(run.states.agent) == set(run.decisions.agent) == {1, 2, 3}
-    assert run.receptions.received[run.receptions.receiver == 4].isna().all()
-    whole = run.receptions[(run.receptions.receiver < 4) & (run.receptions.slot < run.slots.slot.max() // 2)]
-    assert whole.received.notna().all()
-    assert (run.slots.outcome.isna() == run.slots.sender.isna()).all()
-    assert set(run.slots.outcome.dropna()) == {"success"}  # whether cf4 has sent in the others nobody knows
-    assert run.frames.collided.isna().all()
-    page = run_data(flight.whole)
-    assert any("no bag of cf4" in note for note in page["notes"])
-    assert page["slots"]["unknown"] == run.slots.slot[run.slots.outcome.isna()].tolist()
-    assert page["summary"]["slots"]["idle"] == 0
-    assert page["table"][3].keys() & {"path", "heard"} == {"heard"}
-    assert page["table"][3]["heard"] is None
-
-
-def test_verify_finds_what_was_changed_in_a_merged_bag(flight: Flight, tmp_path: Path) -> None:
     topics = ("/swarm/decision", "/cf2/odom")
     with Bag(flight.whole) as bag:
         for number, topic in enumerate(topics):
@@ -265,6 +203,62 @@ def test_verify_finds_what_was_changed_in_a_merged_bag(flight: Flight, tmp_path:
     difference = verify_bag(tmp_path / "lie").difference
     assert difference is not None
     assert (difference.what, difference.slot, difference.agent) == ("report.chosen", liar.slot, 2)
+
+
+def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> None:
+    whole = flight.bags[0].read_bytes()
+    cut = tmp_path / "cf1.mcap"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    bag = read(cut)
+    assert bag.broken_off
+    assert 0 < len(bag.slots) < len(read(flight.bags[0]).slots)
+    found = Merge([bag, *(read(path) for path in flight.bags[1:])]).judge()
+    assert found["broken_off"] == ["cf1"]
+    assert verified(found)
+    for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
+        cut.write_bytes(bad)
+        with pytest.raises(DtsaError):
+            Merge([read(cut)]).judge()
+
+
+def test_a_merged_flight_is_kept_as_a_bag_in_which_nothing_is_known_of_who_has_none(flight: Flight) -> None:
+    found, run = flight.merged["flight"], dtsa.read_bag(flight.whole)
+    assert json.loads((flight.whole / "summary.json").read_text())["flight"] == found
+    assert "channel_load" not in found  # nobody knows how long this network's frames are on the air
+    assert run.summary == found
+    seen = run.ages_by_observer[run.ages_by_observer.counted]
+    assert seen.age_slots.mean() == pytest.approx(found["age_mean_slots"], rel=1e-12)
+    assert seen.error_m.max() == found["estimate_error_max_m"]
+    page = run_data(flight.whole)
+    assert page["summary"]["age_mean_slots"] == found["age_mean_slots"]
+    assert page["slots"]["count"] == len(run.slots)
+    assert page["distances"]["time"]
+    with Reader(flight.whole / "bag") as foreign:  # rosbag2's metadata, and every message, by an independent reader
+        assert foreign.message_count == sum(1 for _ in foreign.messages())
+        assert {"/swarm/frame", "/swarm/reception", "/cf1/odom"} <= foreign.topics.keys()
+    with Bag(flight.whole) as bag:
+        said: dict[str, list[Any]] = {}
+        for message, decoded in bag.typed():
+            said.setdefault(message.topic, []).append(decoded)
+    pictures = [[(one.action, one.id) for one in picture.markers] for picture in said["/swarm/markers"]]
+    assert pictures[0] == [(3, 0)]  # DELETEALL: who vanishes is not left standing
+    assert {agent for picture in pictures for action, agent in picture if action == 0} == {1, 2, 3}
+    assert said["/swarm/status"][0].lost.tolist() == [4]
+    assert said["/swarm/status"][-1].reason == "merged from 3 agents' bags"
+    run = dtsa.read_bag(flight.whole)
+    assert set(run.states.agent) == set(run.decisions.agent) == {1, 2, 3}
+    assert run.receptions.received[run.receptions.receiver == 4].isna().all()
+    whole = run.receptions[(run.receptions.receiver < 4) & (run.receptions.slot < run.slots.slot.max() // 2)]
+    assert whole.received.notna().all()
+    assert (run.slots.outcome.isna() == run.slots.sender.isna()).all()
+    assert set(run.slots.outcome.dropna()) == {"success"}  # whether cf4 has sent in the others nobody knows
+    assert run.frames.collided.isna().all()
+    page = run_data(flight.whole)
+    assert any("no bag of cf4" in note for note in page["notes"])
+    assert page["slots"]["unknown"] == run.slots.slot[run.slots.outcome.isna()].tolist()
+    assert page["summary"]["slots"]["idle"] == 0
+    assert page["table"][3].keys() & {"path", "heard"} == {"heard"}
+    assert page["table"][3]["heard"] is None
 
 
 def test_merge_keeps_the_whole_flight_or_nothing(flight, tmp_path, monkeypatch, capsys):

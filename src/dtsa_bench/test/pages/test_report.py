@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bag_helpers import flight_bag
 from browser_helpers import CHROMIUM, MISSING, Browser, browsing, colours
-from flight_helpers import flight_bag
 from view_helpers import numbers
 
 from dtsa_agent.core import REASONS

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_helpers import flight_bag
 from cli_helpers import refused
-from flight_helpers import flight_bag
 from view_helpers import AGENTS, PATIENCE_S, SLOTS, lossy_bag, numbers, track_of
 
 pytest.importorskip("aiohttp")

@@ -32,13 +32,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
     return synthetic_bag(tmp_path_factory.mktemp("bags") / "flight", slots=60, chunk_size=20_000)
 
 
-def test_a_directory_and_its_file_alone_give_the_same(run: SyntheticRun) -> None:
+def test_messages_are_exactly_those_recorded_in_order_of_time_and_can_be_chosen(run: SyntheticRun) -> None:
     with Bag(run.writer.directory) as whole, Bag(run.writer.path) as alone:
         assert list(whole.messages()) == list(alone.messages())
         assert whole.config == alone.config == RunConfig(run.config).to_dict()
-
-
-def test_messages_are_exactly_those_recorded_in_order_of_time(run: SyntheticRun) -> None:
     with Bag(run.writer.directory) as bag:
         found: dict[str, list[tuple[int, int, bytes]]] = {}
         times = []
@@ -50,9 +47,6 @@ def test_messages_are_exactly_those_recorded_in_order_of_time(run: SyntheticRun)
         assert found == run.written
         assert (bag.start_ns, bag.end_ns) == (min(times), max(times))
         assert {name: topic.count for name, topic in bag.topics.items()} == run.writer.counts
-
-
-def test_topics_and_times_can_be_chosen(run: SyntheticRun) -> None:
     begin, end = SECOND + 100_000_000, SECOND + 300_000_000
     with Bag(run.writer.directory) as bag:
         found = [(m.topic, m.log_time_ns) for m in bag.messages(["/cf1/odom", "/swarm/slot"], begin, end)]

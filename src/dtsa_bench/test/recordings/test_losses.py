@@ -42,7 +42,6 @@ def off_diagonal(rows):
     return matrix[~np.eye(len(matrix), dtype=bool)]
 
 
-# -- rates and chains --------------------------------------------------------------------------------------------------
 def test_rates_are_the_shares_that_were_lost_and_independent_losses_have_no_bursts():
     for seed in range(6):
         slots, senders, outcome = flown(3, 3000, seed, loss=0.2)
@@ -81,7 +80,7 @@ def test_a_file_that_was_learnt_is_a_channel_that_loses_as_much():
     assert again["memory_slots"] == pytest.approx(first["memory_slots"], rel=0.3)
 
 
-def test_links_without_data_lose_as_all_do():
+def test_links_without_data_lose_as_all_do_and_of_merged_flights_what_was_told_counts() -> None:
     slots, senders, outcome = flown(4, 6000, 1, loss=0.3, burst_length=10.0, burst_scope="link")
     outcome[senders == 2, 2] = UNKNOWN
     found = fit_links([(slots, senders, outcome)], 4)
@@ -90,9 +89,6 @@ def test_links_without_data_lose_as_all_do():
     assert bad * enter / (enter + leave) == pytest.approx(found["loss"], rel=1e-4)
     with pytest.raises(ConfigError, match="one frame sent at least"):
         fit_links([(slots[:0], senders[:0], outcome[:0])], 4)
-
-
-def test_of_merged_flights_only_what_agents_have_told_counts():
     received = np.array([[False, True, False], [True, False, True], [True, True, False], [False, True, False]])
     frames = SimpleNamespace(
         slot=np.array([0, 1, 1, 2]), sender=np.array([1, 2, 3, 1]), received=received,
@@ -106,7 +102,6 @@ def test_of_merged_flights_only_what_agents_have_told_counts():
     assert left_out["two senders in the slot"] == 2
 
 
-# -- flights -----------------------------------------------------------------------------------------------------------
 def fly(directory, *words):
     pytest.importorskip("rclpy")
     pytest.importorskip("dtsa_msgs")
@@ -176,7 +171,6 @@ def test_agents_over_udp(tmp_path):
     assert rates.max() < 0.2
 
 
-# -- the command -------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("words", "field"),
     [(("none",), "none"), (("none", "--out", "no/such/place.json"), "out"), (("none", "--out", "there"), "out")],

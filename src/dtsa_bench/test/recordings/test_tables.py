@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet
 import pytest
-from flight_helpers import flight_bag
+from bag_helpers import flight_bag
 
 from dtsa_agent.core import decode_frame
 from dtsa_agent.core.errors import ConfigError

@@ -175,7 +175,7 @@ def test_a_crash_ends_a_flight_and_flights_follow_each_other_by_their_seeds() ->
         np.testing.assert_array_equal(one[0], other[0])
 
 
-def test_what_cannot_be_used_is_named() -> None:
+def test_what_cannot_be_used_or_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for settings, fault in (
         ({"policy": "tdma"}, "policy"), ({"slots": True}, "slots"), ({"loss": 2}, "loss"),
         ({"render_mode": "window"}, "render_mode"),
@@ -196,6 +196,9 @@ def test_what_cannot_be_used_is_named() -> None:
     env.reset()
     with pytest.raises(dtsa.ConfigError, match="reward"):
         env.step(dict.fromkeys(env.agents, 0))
+    monkeypatch.setattr(environment, "ParallelEnv", object)
+    with pytest.raises(dtsa.ConfigError, match=r"pettingzoo: .* an installed PettingZoo"):
+        parallel_env(**SHORT)
 
 
 def test_pettingzoo_finds_nothing_wrong_and_the_last_slot_can_be_read() -> None:
@@ -215,21 +218,12 @@ def test_pettingzoo_finds_nothing_wrong_and_the_last_slot_can_be_read() -> None:
     assert env.render() == "slot 0: success, sent by 3"
 
 
-def test_without_pettingzoo_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(environment, "ParallelEnv", object)
-    with pytest.raises(dtsa.ConfigError, match=r"pettingzoo: .* an installed PettingZoo"):
-        parallel_env(**SHORT)
-
-
-def test_the_example_flies_tdma(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_examples_fly_tdma_and_as_they_were_trained(capsys: pytest.CaptureFixture[str]) -> None:
     runpy.run_path(str(Path(__file__).parents[4] / "examples" / "environment.py"))
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("completed after ")
     by_actions, by_policy = second.partition(": ")[2].split(" slots, of policy tdma in `simulate`: ")
     assert by_actions == by_policy
-
-
-def test_the_learned_example_trains_and_flies_as_it_was_trained() -> None:
     learned = runpy.run_path(str(Path(__file__).parents[4] / "examples" / "learned.py"))
     first, second = (learned["train"](3, 1, population=4, flights=1) for _ in range(2))
     assert first.tolist() == second.tolist()

@@ -233,9 +233,6 @@ def test_links_that_are_one_way_for_good_end_in_hovering(agents: int, policy: st
         assert watch.flown_share(host, 25, 60) == (agents > 2)
 
 
-# Flights drawn from seeds.
-
-
 @pytest.mark.parametrize("seed", [seed for seed in range(1, 70) if draw_flight(seed).lasts_ns == 5 * S])
 def test_both_statements_of_a_station_are_equal_byte_by_byte(seed: int) -> None:
     assert compare_statements(draw_flight(seed)) > 500

@@ -253,12 +253,10 @@ def test_an_option_that_no_plug_in_has_is_refused_with_the_nearest(option, near,
             assert len(said.splitlines()) == 1
 
 
-def test_options_of_plug_ins_that_do_not_fly_are_allowed() -> None:
+def test_options_of_others_are_allowed_and_random_numbers_follow_from_seed_agent_and_name() -> None:
     for _ in range(2):
         SwarmConfig(policy="tdma", options={"event-tdma.error_m": 0.1, "damped.rest_s": 2.0})
 
-
-def test_random_numbers_of_plug_ins_follow_from_seed_agent_and_name() -> None:
     def drawn(seed: int, agent: int, name: str) -> bytes:
         return plug_in_random(SwarmConfig(seed=seed), agent, name).bytes(16)
 
@@ -314,7 +312,7 @@ def test_lots_and_estimates_are_the_same_in_nodes_processes_and_simulator_and_ve
         assert main(["verify", str(tmp_path / f"flight-{processes}")]) == 0
 
 
-def test_what_does_not_exist_or_does_not_import_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_does_not_exist_is_named_and_what_a_plugin_sees_it_cannot_change(monkeypatch: pytest.MonkeyPatch) -> None:
     for kind, near in (("policy", "least-known"), ("estimator", "damped"), ("avoider", "give-way")):
         with pytest.raises(ConfigError, match=f"^{kind}: got 'nothing'.*{near}"):
             SwarmConfig(**{kind: "nothing"})
@@ -322,9 +320,6 @@ def test_what_does_not_exist_or_does_not_import_is_named(monkeypatch: pytest.Mon
     monkeypatch.setattr(POLICIES, "plug_ins", lambda: {"broken": broken})
     with pytest.raises(ConfigError, match="no_such_module"):
         SwarmConfig(policy="broken")
-
-
-def test_what_a_plugin_sees_it_cannot_change() -> None:
     swarm = plugins.make_swarm(SwarmConfig(agents=3, moving=2, policy="least-known"))
     table = plugins.Table(swarm, 0)
     for name in ("sent_position", "in_ap", "last_turn", "own_position", "goal"):

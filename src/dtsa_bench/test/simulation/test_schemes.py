@@ -249,15 +249,26 @@ def test_the_radio_of_an_agent_that_is_switched_off_sends_nothing() -> None:
     assert any(4 in air.slot(next(slots)).senders for _ in range(100))
 
 
-def test_beacons_come_at_their_rate_and_two_with_one_phase_collide_for_good() -> None:
+def test_beacons_come_at_their_rate_also_behind_lines_and_two_with_one_phase_collide() -> None:
     _, carried, _ = traffic("beacons", 1000, options={"beacons.period_ms": 20.0})
     sent = sum(len(slot.lengths) for slot in carried)
     assert sent == pytest.approx(20 * 1000 * 2 / 20, rel=0.02)
     heard = [len({frame[1] for frame, _ in slot.heard}) for slot in carried]
     assert sum(heard[:500]) == pytest.approx(sum(heard[500:]), abs=20)  # the same ones, period after period
+    # Two of three begin while the third one's frame is on the line: they wait, and meet on the air.
+    flown = []
+    for radio in ("plain", "crazyflie"):
+        config = SwarmConfig(agents=12, policy="beacons", slot_ms=2, seed=4, frame="extended")
+        channel = ChannelConfig(agents=12, slot_ns=config.slot_ns, seed=4, radio=radio)
+        air = UnslottedTraffic(make_swarm(config), Channel(channel))
+        carried = [air.slot(slot) for slot in range(1000)]
+        flown.append((sum(len(slot.lengths) for slot in carried), sum(len(slot.heard) for slot in carried)))
+    (sent, heard), (sent_behind, heard_behind) = flown
+    assert sent == sent_behind
+    assert 0 < heard_behind < heard
 
 
-def test_the_token_ring_takes_as_long_as_its_packets_and_stops_with_one_agent() -> None:
+def test_the_token_ring_takes_as_long_as_its_packets_and_survives_losses() -> None:
     """A turn: 19 frames and acknowledgements, TOKEN, RTS, CTS; each is turned to, sent, and carried to and from it."""
     air, carried, config = traffic("dtr", 1000)
     airtime, links_ns = Airtime(), 300_000 + ChannelConfig(agents=20).link_delay_ns
@@ -273,10 +284,7 @@ def test_the_token_ring_takes_as_long_as_its_packets_and_stops_with_one_agent() 
     after = [air.slot(slot) for slot in range(1000, 1400)]
     assert {int(mask.argmax()) for slot in after[200:] for _, mask in slot.heard} == {7}  # sent to it again and again
     assert sum(len(slot.lengths) for slot in after[200:]) == pytest.approx(20, abs=1)  # one agent, every 20 ms
-
-
-def test_the_token_ring_behind_the_lines_of_crazyflies_takes_their_times() -> None:
-    """Each packet crosses the line to its sender's radio, the air, and the line from the radio of who answers."""
+    # Each packet crosses the line to its sender's radio, the air, and the line from the radio of who answers.
     settings = {"agents": 20, "policy": "dtr", "seed": 3, "options": {"dtr.react_ms": 0.0}}
     config = SwarmConfig(**settings)
     channel = ChannelConfig(agents=20, slot_ns=config.slot_ns, radio="crazyflie")
@@ -288,23 +296,6 @@ def test_the_token_ring_behind_the_lines_of_crazyflies_takes_their_times() -> No
     turn_ns = 19 * (frame_ns + short_ns) + 3 * short_ns
     heard = sum(len(air.slot(slot).heard) for slot in range(1000))
     assert heard == pytest.approx(19 * 1000 * config.slot_ns / turn_ns, abs=19)
-
-
-def test_beacons_behind_lines_wait_for_receptions_and_are_heard_all_the_same() -> None:
-    """Two of three begin while the third one's frame is on the line: they wait, and meet on the air."""
-    flown = []
-    for radio in ("plain", "crazyflie"):
-        config = SwarmConfig(agents=12, policy="beacons", slot_ms=2, seed=4, frame="extended")
-        channel = ChannelConfig(agents=12, slot_ns=config.slot_ns, seed=4, radio=radio)
-        air = UnslottedTraffic(make_swarm(config), Channel(channel))
-        carried = [air.slot(slot) for slot in range(1000)]
-        flown.append((sum(len(slot.lengths) for slot in carried), sum(len(slot.heard) for slot in carried)))
-    (sent, heard), (sent_behind, heard_behind) = flown
-    assert sent == sent_behind
-    assert 0 < heard_behind < heard
-
-
-def test_the_token_ring_survives_losses_and_is_for_twenty() -> None:
     config = SwarmConfig(agents=4, policy="dtr", seed=5, slot_ms=2)
     air = UnslottedTraffic(make_swarm(config), Channel(ChannelConfig(agents=4, slot_ns=2_000_000, seed=5, loss=0.3)))
     late = [{int(frame[1]) for frame, _ in air.slot(slot).heard} for slot in range(4000)][3000:]
@@ -313,18 +304,7 @@ def test_the_token_ring_survives_losses_and_is_for_twenty() -> None:
         make_swarm(SwarmConfig(agents=21, policy="dtr"))
 
 
-def test_a_policy_that_listens_needs_the_methods_of_its_radio() -> None:
-    class Deaf:
-        port = ("send", "busy")
-
-        def wake(self, table: object, now_ns: int, radio: Any) -> int:
-            return now_ns + 1
-
-    with pytest.raises(ConfigError, match=r"deaf\.port.*'busy' with the methods sensed and sent"):
-        dtsa.register("policy", "deaf", Deaf)
-
-
-def test_event_triggered_tdma_is_silent_while_it_would_say_nothing_new() -> None:
+def test_event_triggered_tdma_is_silent_without_news_and_sotdma_finds_slots_of_its_own() -> None:
     busy, quiet = (steady(policy, 12, 4).outcome for policy in ("tdma", "event-tdma"))
     assert busy.idle == 0
     assert quiet.idle > 0.4 * quiet.slots
@@ -332,9 +312,6 @@ def test_event_triggered_tdma_is_silent_while_it_would_say_nothing_new() -> None
     flown = dtsa.simulate(agents=12, policy="event-tdma", slot_ms=2, options={"event-tdma.error_m": 0.02}).summary
     assert flown["completed"]
     assert flown["channel_load"] < 0.8 * dtsa.simulate(agents=12, policy="tdma", slot_ms=2).summary["channel_load"]
-
-
-def test_sotdma_finds_slots_of_its_own() -> None:
     run = steady("sotdma", 12, 12, slots=3000)
     late = [slot for slot in run.outcome.collision_slots if slot >= 1500]
     assert len(late) < 0.05 * 1500
@@ -382,7 +359,7 @@ def test_nodes_refuse_what_nodes_cannot_do() -> None:
         make_swarm(SwarmConfig(agents=4, policy="genie-age"), local=[1, 2])
 
 
-def test_wrong_answers_of_such_plug_ins_are_named() -> None:
+def test_wrong_answers_of_such_plug_ins_and_missing_methods_are_named() -> None:
     class Base:
         options = ("to",)
 
@@ -408,3 +385,12 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
     ):
         with pytest.raises(PluginError, match=f"policy {policy}, {said}"):
             simulate(RunConfig(swarm=SwarmConfig(agents=4, policy=policy, options=options)))
+
+    class Deaf:
+        port = ("send", "busy")
+
+        def wake(self, table: object, now_ns: int, radio: Any) -> int:
+            return now_ns + 1
+
+    with pytest.raises(ConfigError, match=r"deaf\.port.*'busy' with the methods sensed and sent"):
+        dtsa.register("policy", "deaf", Deaf)

@@ -91,7 +91,7 @@ def test_the_summary_says_what_the_tracks_say() -> None:
     assert (positions[:, :, ~moving] == flight.scenario.start[:, ~moving]).all()
 
 
-def test_a_crash_ends_the_flight_and_a_timeout_too() -> None:
+def test_crashes_and_timeouts_end_flights_and_one_lost_frame_splits_the_views_of_dtsa() -> None:
     crash = simulate(run(agents=24, estimator="hold", policy="tdma", slot_ms=20.0, timeout_s=20)).summary()
     assert crash["end"] == "crashed"
     assert crash["collided"]
@@ -100,6 +100,15 @@ def test_a_crash_ends_the_flight_and_a_timeout_too() -> None:
     assert late["end"] == "timed out"
     assert late["slots"]["total"] == 50
     assert late["completion_time_s"] is None
+    cases = (("dtsa", 0.0), ("dtsa", 0.01), ("tdma", 0.01))
+    whole, torn, tdma = (fly(agents=12, loss=p, policy=name) for name, p in cases)
+    assert len(set(whole.swarm.digest.tolist())) == 1 < len(set(torn.swarm.digest.tolist()))
+    assert whole.summary()["slots"]["collision"] == 0 < torn.summary()["slots"]["collision"]
+    assert whole.summary()["first_divergence_slot"] is None
+    assert whole.summary()["agreement_share"] == whole.summary()["equal_tables_share"] == 1.0
+    assert 0 < torn.summary()["first_divergence_slot"] < 100
+    assert torn.summary()["agreement_share"] < 0.6
+    assert tdma.summary()["equal_tables_share"] < 1.0 == tdma.summary()["agreement_share"]
 
 
 def test_agents_say_a_new_goal_before_they_fly_and_dtsa_chooses_for_its_reasons() -> None:
@@ -149,15 +158,3 @@ def test_simulate_and_fly_agree_bit_for_bit(tmp_path: Path, agents: int, process
     assert real.summary["estimate_error_mean_m"] == pytest.approx(error, rel=1e-9)
     assert {key: real.summary[key] for key in same} == same
     assert len(same) > 20
-
-
-def test_one_lost_frame_splits_the_views_of_dtsa_but_not_the_choice_of_tdma() -> None:
-    cases = (("dtsa", 0.0), ("dtsa", 0.01), ("tdma", 0.01))
-    whole, torn, tdma = (fly(agents=12, loss=p, policy=name) for name, p in cases)
-    assert len(set(whole.swarm.digest.tolist())) == 1 < len(set(torn.swarm.digest.tolist()))
-    assert whole.summary()["slots"]["collision"] == 0 < torn.summary()["slots"]["collision"]
-    assert whole.summary()["first_divergence_slot"] is None
-    assert whole.summary()["agreement_share"] == whole.summary()["equal_tables_share"] == 1.0
-    assert 0 < torn.summary()["first_divergence_slot"] < 100
-    assert torn.summary()["agreement_share"] < 0.6
-    assert tdma.summary()["equal_tables_share"] < 1.0 == tdma.summary()["agreement_share"]
