@@ -6,12 +6,11 @@ import json
 import math
 import os
 import random
-import socket
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -117,25 +116,11 @@ class Sniffing:
         return self.sniffer.summary()
 
 
-class Stranger:
-    """Sends what it likes to a group of the loopback interface, and hears what is said there."""
-
-    def __init__(self, group: str) -> None:
-        self.socket = UdpPort(UdpSettings(interface="lo", group=group))
-
-    def hear(self, count: int) -> list[bytes]:
-        found: list[bytes] = []
-
-        def enough() -> bool:
-            found.extend(datagram.data for datagram in self.socket.receive(16) if not datagram.own)
-            return len(found) >= count
-
-        wait_for(enough)
-        return found
-
-    def close(self) -> None:
-        with suppress(socket.error):
-            self.socket.close()
+def hear(port: UdpPort, count: int) -> list[bytes]:
+    """So many datagrams that others send, or more."""
+    found: list[bytes] = []
+    wait_for(lambda: found.extend(d.data for d in port.receive(16) if not d.own) or len(found) >= count)
+    return found
 
 
 class Carrier:

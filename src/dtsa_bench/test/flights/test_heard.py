@@ -148,7 +148,7 @@ def test_agents_on_a_network_hear_each_other(tmp_path: Path, kind: str) -> None:
             assert (code, without_states(said)) == (0, ""), said
             assert summary["heard_of"] == [other for other in range(1, AGENTS + 1) if other != agent]
             assert not {"rejected", "malformed", "foreign", "length"} & set(summary["not_taken_in"]), summary
-    merged = bench("merge", *bags(tmp_path), "--out", str(tmp_path / "whole"), "--json")
+    merged = bench("merge", *map(str, sorted(tmp_path.glob("cf*"))), "--out", str(tmp_path / "whole"), "--json")
     assert merged.returncode == 0, merged.stderr
     verified(tmp_path / "whole")
     with Bag(tmp_path / "whole") as bag:
@@ -193,10 +193,6 @@ def test_agents_that_steer_crazyflies_hear_each_other(tmp_path: Path, kind: str)
         done = bench("fly", *shape, *words)
         assert done.returncode == 0, done.stderr
     check_heard(out, summary_of(out), own_bytes, "--auth" in words)
-
-
-def bags(folder: Path) -> list[str]:
-    return [str(folder / f"cf{agent}") for agent in range(1, AGENTS + 1)]
 
 
 @contextmanager

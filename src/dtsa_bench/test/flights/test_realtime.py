@@ -28,18 +28,14 @@ TIGHT = (
 )  # fmt: skip
 
 
-def drifts(seconds: float) -> list[float]:
-    clocks = make_clocks(ClockConfig(drift_ppm=DRIFT_PPM, seed=9), AGENTS)
-    return [clock.drift_ppb * seconds * 1e-6 for clock in clocks]
-
-
 @pytest.mark.alone
 @pytest.mark.realtime
 def test_with_alignment_slots_stay_together_and_without_frames_collide(tmp_path: Path) -> None:
     aligned = tmp_path / "aligned"
     together, apart = fly(aligned, *TIGHT, "--loss", "0.2"), fly(tmp_path / "apart", *TIGHT, "--no-align")
     # Left alone the clocks drift apart, each at its own rate: 5 ms by the end, far more than the 2.2 ms between frames.
-    gained = drifts(apart["flight_time_s"])
+    clocks = make_clocks(ClockConfig(drift_ppm=DRIFT_PPM, seed=9), AGENTS)
+    gained = [clock.drift_ppb * apart["flight_time_s"] * 1e-6 for clock in clocks]  # ms
     assert apart["clock_spread_end_ms"] == pytest.approx(max(gained) - min(gained), abs=0.5)
     assert apart["clock_spread_end_ms"] > 3.0
     assert together["clock_spread_end_ms"] < 1.0

@@ -80,16 +80,12 @@ def before_and_after(out: Path, agent: int) -> tuple[list[Report], list[Report]]
     return found[:back], found[back:]
 
 
-def first_turn(found: list[Report], agent: int) -> Report:
-    return next(report for report in found if report.speaker == agent)
-
-
 def begins_at_an_anchor(found: list[Report], agent: int) -> bool:
     """Whether an agent that is back, on probation, takes no turn of its own before an anchor.
 
     Its reports of the first slots may come too late: the anchor may be its turn right before the first that is known.
     """
-    first, rules = first_turn(found, agent), Memory(Rules(agents=4, slot_s=0.01))
+    first, rules = next(report for report in found if report.speaker == agent), Memory(Rules(agents=4, slot_s=0.01))
     before = first.slot - 4
     return first.reason == "anchor" or (before < found[0].slot and rules.is_anchor(before))
 

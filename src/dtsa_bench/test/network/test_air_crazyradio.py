@@ -7,8 +7,8 @@ import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import air_helpers as helpers
@@ -56,22 +56,8 @@ def key() -> Iterator[None]:
         yield
 
 
-@dataclass
-class Flight:
-    """All agents, and one who listens."""
-
-    bags: list[Path]
-    summaries: dict[int, dict[str, Any]]
-    said: list[str]
-    merged: dict[str, Any]
-    whole: Path  # directory with the merged bag
-    sniffed: dict[str, Any]
-    heard: Path  # bag of the listener
-    told: list[dict[str, Any]]  # what a page gets of one who listens
-
-
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> Flight:
+def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> SimpleNamespace:
     """Agents start one after the other, with clocks that differ."""
     directory = tmp_path_factory.mktemp("crazyradio")
     radio, heard = directory / "radio", directory / "sniffed.mcap"
@@ -89,14 +75,17 @@ def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> Flight:
     _, merged = helpers.merge_bags(reversed(paths), directory / "whole")
     summaries = {one.agent.own.id: one.agent.summary() for one in flying}
     said = [line for one in flying for line in one.said]
-    return Flight(paths, summaries, said, merged, directory / "whole", sniffed, heard, told())
+    return SimpleNamespace(
+        bags=paths, summaries=summaries, said=said, merged=merged, whole=directory / "whole", sniffed=sniffed,
+        heard=heard, told=told(),
+    )  # fmt: skip
 
 
 def own(agent: int) -> dict[str, int]:
     return {"clock_offset_ns": OFFSET_NS * agent, "clock_drift_ppb": 20_000 * (agent - 2)}
 
 
-def test_agents_become_one_group_on_one_time_line_and_keep_the_rules(flight: Flight) -> None:
+def test_agents_become_one_group_on_one_time_line_and_keep_the_rules(flight: SimpleNamespace) -> None:
     helpers.check_merged(flight.merged, flight.whole, 300)
     assert flight.merged["missing"] == []
     for agent, summary in flight.summaries.items():

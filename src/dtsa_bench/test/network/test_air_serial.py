@@ -6,8 +6,8 @@ import errno
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import air_helpers as helpers
@@ -45,19 +45,8 @@ def port_settings(made: FakeModems, number: int) -> SerialSettings:
     return SerialSettings(device=str(made.devices[number - 1]), baud=kind.line_baud, modem=kind.modem)
 
 
-@dataclass
-class Flight:
-    """Three agents; the second one's modem was unplugged, and the third one was cut off for a while."""
-
-    agents: list[helpers.Flying]
-    sniffed: dict[str, Any]
-    shown: str
-    merged: dict[str, Any]
-    whole: Path
-
-
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+def flight(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     directory = tmp_path_factory.mktemp("serial")
     with modems(QUICK, directory, loss=0.05, seed=3) as made:
         ports = [port_settings(made, agent) for agent in (1, 2, 3)]
@@ -83,14 +72,14 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         source.stopped = True
         source.run()
     _, merged = helpers.merge_bags([directory / f"cf{agent}.mcap" for agent in (1, 2, 3)], directory / "whole")
-    return Flight(flying, sniffed, track.name, merged, directory / "whole")
+    return SimpleNamespace(agents=flying, sniffed=sniffed, shown=track.name, merged=merged, whole=directory / "whole")
 
 
 def own(agent: int) -> dict[str, int]:
     return {"clock_offset_ns": agent * 10**9, "clock_drift_ppb": 30_000 * (agent - 2)}
 
 
-def test_groups_become_one_flight_in_which_all_keep_the_rules(flight: Flight) -> None:
+def test_groups_become_one_flight_in_which_all_keep_the_rules(flight: SimpleNamespace) -> None:
     helpers.check_merged(flight.merged, flight.whole, 200)
     assert run_data(flight.whole)["slots"]["count"] > 100
     for one in flight.agents:

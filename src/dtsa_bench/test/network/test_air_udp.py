@@ -9,8 +9,8 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import air_helpers as helpers
@@ -21,7 +21,7 @@ from waiting import wait_for
 
 import dtsa
 from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import UdpSettings
+from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.commands.cli import main
@@ -31,7 +31,7 @@ from dtsa_bench.recordings.bag.writer import BagWriter
 from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.merge import Merge, verified
 from dtsa_bench.recordings.merge.merged_messages import MergedMessages
-from dtsa_bench.recordings.merge.merged_run import MergedRun, lay
+from dtsa_bench.recordings.merge.merged_run import lay
 from dtsa_bench.recordings.merge.merged_writer import write
 from dtsa_bench.recordings.merge.timeline import Crossing, fit
 from dtsa_bench.recordings.verify import verify_bag
@@ -42,27 +42,14 @@ CONFIG = SwarmConfig(agents=4, policy="lease", slot_ms=20.0, open_every=0, adopt
 OFFSET_NS = 700_000_000
 
 
-@dataclass
-class Flight:
-    """Three of four agents, strangers among them."""
-
-    bags: list[Path]
-    summaries: dict[int, dict[str, Any]]
-    merged: dict[str, Any]
-    run: MergedRun
-    whole: Path  # directory with the merged bag
-    sniffed: dict[str, Any]  # by who has listened since they count alike
-    told: list[dict[str, Any]]  # what a page gets of one who listens
-
-
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+def flight(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """Agents start one after the other, with clocks that differ; a stranger talks in between; one leaves early."""
     helpers.need_multicast()
     directory, group = tmp_path_factory.mktemp("udp"), helpers.own_group()
     udp = UdpSettings(interface="lo", group=group)
     paths = [directory / f"cf{agent}.mcap" for agent in (1, 2, 3)]
-    stranger = helpers.Stranger(group)
+    stranger = UdpPort(udp)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DTSA_AUTH_KEY", KEY)
         sniffing = helpers.Sniffing(CONFIG, udp)
@@ -80,32 +67,34 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
             sniffed = sniffing.end()
     run, merged = helpers.merge_bags(reversed(paths), directory / "whole")
     summaries = {one.agent.own.id: one.agent.summary() for one in flying}
-    return Flight(paths, summaries, merged, run, directory / "whole", sniffed, told())
+    return SimpleNamespace(
+        bags=paths, summaries=summaries, merged=merged, run=run, whole=directory / "whole", sniffed=sniffed, told=told()
+    )
 
 
 def own(agent: int) -> dict[str, int]:
     return {"clock_offset_ns": OFFSET_NS * agent, "clock_drift_ppb": 40_000 * (agent - 2)}
 
 
-def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
+def _disturb(stranger: UdpPort, flying: list[helpers.Flying]) -> None:
     """Noise, frames of another swarm, changed frames, the same ones again at once and much later."""
 
     def repeats() -> bool:
-        stranger.socket.send(stranger.hear(1)[-1])
+        stranger.send(helpers.hear(stranger, 1)[-1])
         return all(one.agent.tally.refused["repeated"] for one in flying)
 
     wait_for(repeats)
-    kept = stranger.hear(6)  # of two at least: to its sender an old datagram is a repeated one
+    kept = helpers.hear(stranger, 6)  # of two at least: to its sender an old datagram is a repeated one
     first = kept[0]
     for data in (b"", b"noise" * 50, b"x" * 2000, first[:30], first[:4] + b"abcd" + first[8:], first[:26] + bytes(60)):
-        stranger.socket.send(data)
-    stranger.socket.send(first[:20] + bytes([first[20] ^ 1]) + first[21:])
+        stranger.send(data)
+    stranger.send(first[:20] + bytes([first[20] ^ 1]) + first[21:])
     time.sleep(3 * CONFIG.slot_s)
     for data in kept:
-        stranger.socket.send(data)
+        stranger.send(data)
 
 
-def test_groups_become_one_flight_on_one_time_line_in_which_all_keep_the_rules(flight: Flight) -> None:
+def test_groups_become_one_flight_on_one_time_line_in_which_all_keep_the_rules(flight: SimpleNamespace) -> None:
     helpers.check_merged(flight.merged, flight.whole, 150)
     assert flight.merged["clock_spread_ms"]["end"] < CONFIG.slot_ms / 2
     for agent, summary in flight.summaries.items():
@@ -132,7 +121,7 @@ def test_groups_become_one_flight_on_one_time_line_in_which_all_keep_the_rules(f
     assert line["residual_us"]["p50"] < 1000
 
 
-def test_a_page_is_told_what_a_listener_heard(flight: Flight) -> None:
+def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
     """Who sends in which slot, where the frames say that all are, who comes and who leaves; and nothing more."""
 
     def numbers(text: str, kind: str) -> Any:
@@ -167,7 +156,7 @@ def test_a_page_is_told_what_a_listener_heard(flight: Flight) -> None:
     assert (last["tables"], last["agree"]) == (0, [0, 0])
 
 
-def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: Flight, tmp_path: Path) -> None:
+def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespace, tmp_path: Path) -> None:
     bags = [read(path) for path in flight.bags]
     said = bags[0].slots[-20]
     said.chosen = 4 if said.chosen != 4 else 1
@@ -205,7 +194,7 @@ def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: Flight, tmp_p
     assert (difference.what, difference.slot, difference.agent) == ("report.chosen", liar.slot, 2)
 
 
-def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> None:
+def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Path) -> None:
     whole = flight.bags[0].read_bytes()
     cut = tmp_path / "cf1.mcap"
     cut.write_bytes(whole[: len(whole) * 2 // 3])
@@ -221,7 +210,7 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> No
             Merge([read(cut)]).judge()
 
 
-def test_a_merged_flight_is_kept_as_a_bag_in_which_nothing_is_known_of_who_has_none(flight: Flight) -> None:
+def test_a_merged_flight_is_kept_as_a_bag_in_which_nothing_is_known_of_who_has_none(flight: SimpleNamespace) -> None:
     found, run = flight.merged["flight"], dtsa.read_bag(flight.whole)
     assert json.loads((flight.whole / "summary.json").read_text())["flight"] == found
     assert "channel_load" not in found  # nobody knows how long this network's frames are on the air
@@ -294,7 +283,7 @@ def test_commands_for_other_bags_say_what_is_meant_for_these(flight, command, ca
     assert len(said.splitlines()) == 1
 
 
-def test_bags_that_do_not_belong_together_are_refused(flight: Flight) -> None:
+def test_bags_that_do_not_belong_together_are_refused(flight: SimpleNamespace) -> None:
     one = read(flight.bags[0])
     with pytest.raises(ConfigError, match="one process of cf1 at a time"):
         Merge([one, read(flight.bags[0])]).judge()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -84,11 +85,6 @@ def words_of(track: Track) -> str:
     )
 
 
-def environment(process: int) -> dict[str, str]:
-    text = Path(f"/proc/{process}/environ").read_text()
-    return dict(entry.partition("=")[::2] for entry in text.split("\0") if entry)
-
-
 @pytest.mark.ros
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 @pytest.mark.realtime
@@ -101,7 +97,8 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
     with browsing() as browser, page as (process, url), ExitStack() as stack:
         browser.open(url)
         browser.wait_for("dtsa.live.view.run.record.count > 20")
-        domain = int(environment(pid_of(process.pid, 2))["ROS_DOMAIN_ID"])
+        environment = Path(f"/proc/{pid_of(process.pid, 2)}/environ").read_text()
+        domain = int(re.search(r"\bROS_DOMAIN_ID=(\d+)", environment)[1])  # type: ignore[index]
         source = stack.enter_context(on_graph(listener, domain))
         wait_for(lambda: listener.since(0, 1)[1], what="nothing is heard on the graph")
         browser.run("document.querySelector('.orders select').value = '2'")
