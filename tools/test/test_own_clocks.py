@@ -25,11 +25,7 @@ TRUST_NS = 1_000_000
 
 
 class OwnClocks:
-    """A swarm of stations, their clocks and their channel.
-
-    :param start_ns: ns of the channel's time: when each agent is switched on; None: all begin with slot 0 at 0.
-    :param jitter_ns: standard deviation of when a frame leaves.
-    """
+    """Stations on a channel, switched on at `start_ns`, or all with slot 0; jitter: standard deviation of sends."""
 
     def __init__(
         self, config: SwarmConfig, channel: ChannelConfig, clocks: Sequence[AgentClock],

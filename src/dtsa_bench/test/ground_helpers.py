@@ -89,10 +89,7 @@ class Bridge:
 
 @contextmanager
 def running(graph: Graph, command: Sequence[str], names: Sequence[str] = (), **more: str) -> Iterator[Bridge]:
-    """A process in a graph with more in its environment; it is killed in the end.
-
-    :param names: vehicles of the operator.
-    """
+    """A process in a graph with more in its environment, and an operator of vehicles; it is killed in the end."""
     started = Bridge(graph, command, names, more)
     try:
         yield started

@@ -28,10 +28,13 @@ def fake_command(monkeypatch: pytest.MonkeyPatch, action: object) -> None:
     monkeypatch.setattr(cli, "COMMANDS", {"probe": "does what the test says"})
 
 
-def test_exit_code_and_arguments_reach_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exit_code_and_arguments_reach_the_command_and_a_bug_keeps_its_traceback(monkeypatch):
     fake_command(monkeypatch, lambda args: args.slots)
     assert cli.main(["probe", "--slots", "7"]) == 7
     assert cli.main(["probe"]) == 0
+    fake_command(monkeypatch, MagicMock(side_effect=ZeroDivisionError))
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["probe"])
 
 
 @pytest.mark.parametrize(("error", "code", "said"), [
@@ -42,12 +45,6 @@ def test_exit_code_and_arguments_reach_the_command(monkeypatch: pytest.MonkeyPat
 def test_an_error_is_one_line_and_an_exit_code(error, code, said, monkeypatch, capsys):
     fake_command(monkeypatch, MagicMock(side_effect=error))
     assert (cli.main(["probe"]), capsys.readouterr().err.strip()) == (code, said.strip())
-
-
-def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake_command(monkeypatch, MagicMock(side_effect=ZeroDivisionError))
-    with pytest.raises(ZeroDivisionError):
-        cli.main(["probe"])
 
 
 @pytest.mark.parametrize("words", [["probe", "--slots", "many"], ["probe", "--nothing"], ["nonsense"], []])

@@ -114,9 +114,7 @@ def test_sealed_frames_on_a_network_need_a_session(words, session, capsys, monke
     assert "auth_session: got 0; allowed: 1 to" in refused([*words, "--interface", "lo", *session], capsys)
 
 
-def test_completion_knows_every_command_and_option_and_results_are_printed_as_json(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_completion_knows_every_command_and_option_and_results_are_printed_as_json(capsys):
     for command in ("demo", "fly", "simulate", "sweep", "verify", "recover", "export"):
         parser = parser_of(command)
         assert any("--json" in action.option_strings for action in parser._actions), command

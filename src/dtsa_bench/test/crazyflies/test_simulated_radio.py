@@ -266,7 +266,7 @@ def test_packets_that_are_not_fetched_wait_and_more_than_eight_are_dropped_and_c
     assert ears.dongle.sniffer.dropped == 0
 
 
-def test_a_sniffer_hears_polls_and_acknowledgements_to_its_two_addresses() -> None:
+def test_a_sniffer_hears_its_two_addresses_and_broadcasts_are_not_for_the_ground_link() -> None:
     room = Room(THREE, (station(1), station(2)))
     room.tune(0, room.stations[0])
     room.tune(1, room.stations[0])
@@ -279,9 +279,6 @@ def test_a_sniffer_hears_polls_and_acknowledgements_to_its_two_addresses() -> No
     room.exchange(PACKET, at_ns=100_000 * US)
     empty = bytes((0xF3, 0x01, 45))
     assert [(data[2], data[7:]) for _, data in ears.packets] == [(0, PACKET), (0, empty), (1, PACKET), (1, empty)]
-
-
-def test_broadcasts_between_crazyflies_are_not_for_the_ground_link() -> None:
     room, _ = sniffing(THREE, (station(1),))
     room.exchange(esb.BROADCAST + SPOKEN, at_ns=5_000 * US)
     assert room.heard == []

@@ -111,9 +111,7 @@ def test_the_terminal_shows_every_interval_whatever_its_width(table: SweepTable)
     assert sorted(set(narrow.split())) == sorted(set(wide.split()))
 
 
-def test_measures_that_no_flight_has_take_no_column_and_intervals_a_line(
-    table: SweepTable, swept: dtsa.SweepResult
-) -> None:
+def test_measures_that_no_flight_has_take_no_column_and_intervals_a_line(table, swept):
     plan = make_sweep({"axes": {"loss": [0.0]}, "base": {**BASE, "timeout_s": 0.3}, "seeds": 2}, "short")
     short = SweepTable(plan, run_all(plan.batch))
     assert "age slots" in table_text(short)

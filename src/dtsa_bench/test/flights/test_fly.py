@@ -159,9 +159,7 @@ def test_after_a_signal_no_process_is_started(tmp_path: Path, monkeypatch: pytes
     assert list((tmp_path / "out" / "log").iterdir()) == []
 
 
-def test_variables_of_a_shell_and_modules_in_its_folder_do_not_reach_agents(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_variables_of_a_shell_and_modules_in_its_folder_do_not_reach_agents(capsys, tmp_path, monkeypatch):
     shell = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "ROS_DISCOVERY_SERVER": "a:1", RANGE: "OFF", "HOME": "/"}
     clear_hindrances(shell)
     assert shell == {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", RANGE: "LOCALHOST", "HOME": "/"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import subprocess
@@ -20,9 +21,6 @@ from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
 
-import json
-
-import pytest
 from dtsa_msgs.msg import Frame, Process, Report, Slot, Transmission
 from rclpy.serialization import serialize_message
 

@@ -121,7 +121,7 @@ def test_a_flipped_bit_in_what_a_record_is_brings_nothing_wrong(run, tmp_path, r
     check_flipped(run, tmp_path, [(place, bit) for k, place in chosen for bit in range((first + k) % 3, 8, 3)])
 
 
-def test_a_hole_in_the_middle_ends_it_and_is_named(run: SyntheticRun, tmp_path: Path) -> None:
+def test_a_hole_in_the_middle_is_named_and_the_new_bag_knows_its_run(run: SyntheticRun, tmp_path: Path) -> None:
     rows, chunks = rows_of(run.writer.path), chunks_of(run.writer.path)
     data = bytearray(run.writer.path.read_bytes())
     (start, _, _), (_, end, _) = chunks[1], chunks[2]
@@ -131,9 +131,6 @@ def test_a_hole_in_the_middle_ends_it_and_is_named(run: SyntheticRun, tmp_path: 
     assert found == rows[: chunks[0][2]]
     assert said[0].startswith(f"what stands at byte {start} cannot be read")
     assert said[1] == f"{len(rows) - chunks[0][2]} of the {len(rows)} messages that the file had are lost"
-
-
-def test_the_new_bag_knows_the_run_and_where_it_comes_from(run: SyntheticRun, tmp_path: Path) -> None:
     source = tmp_path / "flight"
     source.mkdir()
     data = run.writer.path.read_bytes()

@@ -69,7 +69,7 @@ def test_metadata_has_every_mandatory_field_and_describes_each_topic(run: Synthe
         }  # fmt: skip
 
 
-def test_mcap_reads_header_schemas_channels_indexes_and_both_metadata_records(run: SyntheticRun) -> None:
+def test_two_other_libraries_read_headers_schemas_indexes_metadata_and_every_message(run: SyntheticRun) -> None:
     with run.writer.path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
@@ -98,9 +98,6 @@ def test_mcap_reads_header_schemas_channels_indexes_and_both_metadata_records(ru
     assert first["message_count"] == 0
     assert first["custom_data"]["configuration"] == last["custom_data"]["configuration"]
     assert last == content(run)
-
-
-def test_rosbags_reads_every_message_and_decodes_it(run: SyntheticRun) -> None:
     store = typestore()
     found: dict[str, list[tuple[int, bytes]]] = {}
     with Reader(run.writer.directory) as reader:

@@ -53,7 +53,7 @@ def test_one_wrong_receiver_never_passes(frames: list[tuple[int, int, int]], fra
         check_on_air(ChannelConfig(agents=5), frames, flip=(frame, receiver))
 
 
-def test_a_dropped_frame_has_disturbed_nobody() -> None:
+def test_two_frames_at_one_time_are_never_both_heard_but_a_dropped_one_disturbs_nobody() -> None:
     """Agent 1's frame met that of agent 2 in time, but came too late to be on the air: all heard agent 2."""
     sent = SentFrames(ChannelConfig(agents=3), own_clocks=True)
     nobody, others = np.zeros(3, dtype=bool), np.array([True, False, True])
@@ -68,6 +68,13 @@ def test_a_dropped_frame_has_disturbed_nobody() -> None:
     assert sent.check_verdicts([], late=1) == 1
     with pytest.raises(Mismatch):
         sent.check_verdicts([])
+    length_ns = ChannelConfig(agents=3).airtime.total_ns(24)
+    with pytest.raises(Mismatch, match="both at cf3"):
+        both_heard(length_ns // 2, second=1).check_overlaps()
+    both_heard(length_ns, second=1).check_overlaps()
+    sent = both_heard(length_ns // 2, second=0)
+    sent.check_overlaps()
+    assert sent.safety()["overlapping_pairs"] == 1
 
 
 def both_heard(gap_ns: int, second: int) -> SentFrames:
@@ -79,16 +86,6 @@ def both_heard(gap_ns: int, second: int) -> SentFrames:
         sent.deliver(0, sender, bytes(24), received)
         sent.judged(0, sender, received, 0, 0)
     return sent
-
-
-def test_two_frames_at_one_time_are_never_both_heard() -> None:
-    length_ns = ChannelConfig(agents=3).airtime.total_ns(24)
-    with pytest.raises(Mismatch, match="both at cf3"):
-        both_heard(length_ns // 2, second=1).check_overlaps()
-    both_heard(length_ns, second=1).check_overlaps()
-    sent = both_heard(length_ns // 2, second=0)
-    sent.check_overlaps()
-    assert sent.safety()["overlapping_pairs"] == 1
 
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:

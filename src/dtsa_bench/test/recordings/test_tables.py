@@ -89,7 +89,7 @@ def test_tables_have_the_documented_columns_and_the_bag_s_values(flight: Path, t
         assert [row["position_x_m"], row["position_y_m"], row["position_z_m"]] == pytest.approx(track, abs=1e-9)
 
 
-def test_who_received_what_and_who_knew_what(flight: Path, tmp_path: Path) -> None:
+def test_who_received_what_and_who_knew_what_with_and_without_losses(flight: Path, tmp_path: Path) -> None:
     export(flight, tmp_path / "tables", tables=["frames", "receptions", "ages", "ages_by_observer"])
     tables, run = read(tmp_path / "tables", "parquet"), load_run(flight)
     by_frame = tables["receptions"].groupby(["slot", "sender"])["received"]
@@ -112,10 +112,7 @@ def test_who_received_what_and_who_knew_what(flight: Path, tmp_path: Path) -> No
     assert np.allclose(counted["age_slots"].mean(), means["age_slots"])
     assert np.allclose(counted["error_m"].mean(), means["error_m"])
     assert (counted.size() == means["observers"]).all()
-
-
-def test_pairs_of_a_flight_without_losses_have_all_observers(tmp_path: Path) -> None:
-    """One table stands for all agents there."""
+    # One table stands for all agents there.
     flight_bag(tmp_path / "bag", slots=40, agents=4, moving=2, policy="tdma", seed=1)
     run = load_run(tmp_path / "bag")
     known = module.arrow_table(run, "ages_by_observer").to_pandas()

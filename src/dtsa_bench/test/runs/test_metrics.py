@@ -35,7 +35,7 @@ def along(scenario: Scenario, share: float, bulge: float = 0.0) -> np.ndarray:
     return now
 
 
-def test_completion_is_when_all_are_near_then_the_tail_follows() -> None:
+def test_completion_is_when_all_are_near_and_one_that_has_not_arrived_is_enough_to_time_out() -> None:
     metrics, scenario = pair_on_a_line(tail_s=0.5)
     ends = []
     for slot in range(40):
@@ -53,9 +53,6 @@ def test_completion_is_when_all_are_near_then_the_tail_follows() -> None:
     assert summary["slots"] == {"total": 24, "success": 24, "collision": 0, "idle": 0}
     assert summary["realtime_factor"] == pytest.approx(1.0)
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
-
-
-def test_one_mover_that_has_not_arrived_is_enough_to_time_out() -> None:
     metrics, scenario = pair_on_a_line(timeout_s=3.0)
     end, slot = "", -1
     while not end:
