@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fly_helpers import fly, readable, verified
+from fly_helpers import fly, readable, start_flight, summary_of, verified
+from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
-
-
-from waiting import wait_for
 
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_channel_sim import ClockConfig, make_clocks
