@@ -95,7 +95,6 @@ def begins_at_an_anchor(found: list[Report], agent: int) -> bool:
     ("__ns:=/cf2", [2], LEASE), ("__node:=swarm_host_2", [3, 4], ("--processes", "2", *LEASE)),
     ("__ns:=/cf2", [2], ("--policy", "tdma", "--frame", "extended")),
 ])  # fmt: skip
-@pytest.mark.alone
 @pytest.mark.realtime
 def test_a_killed_process_comes_back_and_its_agents_are_heard_again(tmp_path, argument, agents, words):
     with start_flight(tmp_path, *ROOMY, *words, "--respawn", "0") as flight:
@@ -118,7 +117,6 @@ def test_a_killed_process_comes_back_and_its_agents_are_heard_again(tmp_path, ar
 
 
 @pytest.mark.ros
-@pytest.mark.alone
 @pytest.mark.realtime
 def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None:
     with start_flight(tmp_path, *ROOMY, *LEASE) as flight:
@@ -136,7 +134,6 @@ def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None
 
 
 @pytest.mark.ros
-@pytest.mark.alone
 @pytest.mark.realtime
 def test_sigterm_lets_an_agent_say_farewell_and_a_second_one_does_not_wait(tmp_path: Path) -> None:
     with start_flight(tmp_path, *ROOMY, "--policy", "lease", "--respawn", "0") as flight:
@@ -183,7 +180,6 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
 
 
 @pytest.mark.ros
-@pytest.mark.alone
 @pytest.mark.realtime
 def test_an_agent_may_come_late(tmp_path: Path) -> None:
     with start_flight(tmp_path, *ROOMY, *LEASE, "--late", "cf3=0.5") as flight:
@@ -200,7 +196,6 @@ def test_an_agent_may_come_late(tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
-@pytest.mark.alone
 @pytest.mark.realtime
 def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) -> None:
     few = ("--agents", "2", "--moving", "2", "--processes", "1", "--mode", "realtime", "--policy", "lease")

@@ -140,7 +140,7 @@ def test_ctrl_c_ends_it_soon_and_leaves_no_process(tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
-@pytest.mark.alone
+@pytest.mark.realtime
 @pytest.mark.skipif(not os.environ.get("CI"), reason="the whole demo takes most of a minute; once in CI")
 def test_the_whole_demo(tmp_path: Path, flights: dict[str, FinishedFlight]) -> None:
     out = tmp_path / "demo"
