@@ -339,6 +339,7 @@ def test_a_second_agent_of_the_same_id_hovers_and_is_silent(tmp_path: Path) -> N
         other.end()
         again = start(2, "again.mcap")
         wait_for(lambda: len(again.slots) > 5)  # who comes back is welcome
+        wait_for(lambda: again.heard[1] > 5 and first.speed > 0.05)  # in one time, and not new
         second = start(1, "second.mcap")
         wait_for(lambda: "hovers: another agent sends as 1" in second.said)
     assert second.agent.summary()["sent"] <= 1  # its first turn may come before it hears the other one
