@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
+from dtsa_agent.air.datagram import NETWORK
+from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.pages.report.data import run_data
-from dtsa_bench.recordings.merge.agent_bag import NothingWritten, read
+from dtsa_bench.recordings.merge.agent_bag import AgentBag, NothingWritten, read
 from dtsa_bench.recordings.merge.known_pairs import all_known_after
 from dtsa_bench.recordings.merge.merge import Merge
 from dtsa_bench.recordings.merge.timeline import Crossing, Life, both_ways, fit
@@ -164,3 +166,20 @@ def test_clocks_are_fit_within_groups_connected_both_ways() -> None:
     line = fit([*many[:7], back, *many[7:]], 30_000)
     assert line.clocks.keys() == {(1, 0), (2, 0)}
     assert line.flight_ns == pytest.approx(MS, abs=50_000)
+
+
+def test_slots_of_times_that_were_given_up_are_kept_apart() -> None:
+    """Two processes of an agent, each of which took over a time with smaller slot numbers."""
+    zero = np.zeros(3)
+
+    def process(slots: list[int]) -> AgentBag:
+        records = [
+            SlotRecord(slot, 0, 0, at == 0, 1, 0, 0, 0, 0.0, np.zeros((1, 3)), zero, zero, zero)
+            for at, slot in enumerate(slots)
+        ]
+        return AgentBag(Path("cf1.mcap"), 1, CONFIG, NETWORK, 0, records)
+
+    lives = Merge([process([70, 71, 3, 4]), process([90, 91, 80, 5, 6])]).lives
+    assert {life: [record.slot for record in bag.slots] for life, bag in lives.items()} == {
+        (1, 0): [3, 4], (1, 1): [5, 6], (1, -1): [70, 71], (1, -2): [80], (1, -3): [90, 91],
+    }  # fmt: skip

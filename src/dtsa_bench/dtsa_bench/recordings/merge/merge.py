@@ -112,7 +112,9 @@ def _lives(bags: Sequence[AgentBag]) -> dict[Life, AgentBag]:
     if not any(bag.slots for bag in bags):
         raise ConfigError("bags", str(bags[0].path) if bags else "", "bags with a slot in them")
     found: dict[Life, AgentBag] = {}
-    for bag in sorted(map(_last_time, bags), key=lambda bag: (bag.agent, bag.slots[0].slot if bag.slots else -1)):
+    times = {id(bag): _times(bag) for bag in bags}
+    last = [dataclasses.replace(bag, slots=times[id(bag)][-1]) for bag in bags]
+    for bag in sorted(last, key=lambda bag: (bag.agent, bag.slots[0].slot if bag.slots else -1)):
         if bag.swarm != bags[0].swarm:
             theirs, ours = bag.swarm.to_dict(), bags[0].swarm.to_dict()
             other = ", ".join(
@@ -124,24 +126,18 @@ def _lives(bags: Sequence[AgentBag]) -> dict[Life, AgentBag]:
         if before is not None and before.slots and (not bag.slots or bag.slots[0].slot <= before.slots[-1].slot):
             raise ConfigError("bag", str(bag.path), f"one process of cf{bag.agent} at a time: {before.path} is another")
         found[(bag.agent, number)] = bag
-    return found | {life: time for bag in bags for life, time in _earlier_times(bag)}
+    for bag in bags:  # what it flew before it took over a time with smaller numbers: lives of negative ones
+        earlier = dataclasses.replace(bag, summary={}, refused=Counter())
+        for slots in reversed(times[id(bag)][:-1]):
+            number = -1 - sum(agent == bag.agent and number < 0 for agent, number in found)
+            found[(bag.agent, number)] = dataclasses.replace(earlier, slots=slots)
+    return found
 
 
 def _times(bag: AgentBag) -> list[list[SlotRecord]]:
     """The slots of an agent, split where they count back: there it took over another time."""
     starts = [0, *(k for k in range(1, len(bag.slots)) if bag.slots[k].slot <= bag.slots[k - 1].slot), len(bag.slots)]
     return [bag.slots[a:b] for a, b in pairwise(starts)]
-
-
-def _last_time(bag: AgentBag) -> AgentBag:
-    return dataclasses.replace(bag, slots=_times(bag)[-1])
-
-
-def _earlier_times(bag: AgentBag) -> list[tuple[Life, AgentBag]]:
-    """What an agent flew before it took over a time with smaller slot numbers: lives with negative numbers."""
-    earlier = _times(bag)[:-1]
-    empty = dataclasses.replace(bag, summary={}, refused=Counter())
-    return [((bag.agent, k - len(earlier)), dataclasses.replace(empty, slots=slots)) for k, slots in enumerate(earlier)]
 
 
 def _apart(lives: Mapping[Life, AgentBag], line: TimeLine) -> list[list[str]]:
