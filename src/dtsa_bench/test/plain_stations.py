@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from dtsa_agent.core.kernel import ffi
+from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference import station as reference
 from dtsa_agent.core.reference.agent import Agent
 from dtsa_agent.core.reference.rules import Rules
 from dtsa_agent.core.reference.table import Table
 from dtsa_bench.simulation.live import LiveFlight, S, _c_flight, fly
 
-STARTED, RECEIVED, STEPPED, SENT, LEFT, ENDED, NEW_GOAL = range(7)  # kinds of a live_call
+STARTED, RECEIVED, STEPPED = lib.LIVE_STARTED, lib.LIVE_RECEIVED, lib.LIVE_STEPPED  # kinds of a live_call
+SENT, LEFT, NEW_GOAL = lib.LIVE_SENT, lib.LIVE_LEFT, lib.LIVE_NEW_GOAL
 
 
 def compare_statements(flight: LiveFlight) -> int:

@@ -191,7 +191,6 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         }
         if (kind & 64) step(&in, station, &s, now);
         dtsa_station_awaits_frame(station, now);
-        dtsa_station_heard_ns(station, (int)(kind & 15));
         check_status(station, &s);
     }
     free(station);

@@ -6,15 +6,15 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, SAME_ID, STATES
+from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, OTHER_SETTINGS, REJECTED, SAME_ID, STATES
 
 _SECOND = 1_000_000_000
 _STATE_NS = _SECOND  # a state that lasts is reported after this time, and the next one not before twice that
 _FOREIGN_NS = 30 * _SECOND  # from a line about foreign datagrams to the next
 _TIMED_FRAMES, _OFF_SHARE = 100, 0.05  # frames off their slots: of so many, so large a share means too short slots
 _FOREIGN = {
-    "other settings": "other settings: slot length, agents, policy, seed, session or another one that all must share",
-    "rejected": "another key, or frames played again",
+    OTHER_SETTINGS: "other settings: slot length, agents, policy, seed, session or another one that all must share",
+    REJECTED: "another key, or frames played again",
 }
 
 

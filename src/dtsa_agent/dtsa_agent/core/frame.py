@@ -21,7 +21,6 @@ TAG_LENGTH: int = lib.DTSA_TAG_BYTES  # bytes of authentication after a frame, a
 MAX_EXTENDED_AGENTS: int = lib.DTSA_EXTENDED_AGENTS_MAX  # ids have 8 bits in extended frames
 OPEN: int = lib.LEASE_OPEN  # lessee of a turn that is open to all who wake
 _HEADER_LENGTH = 8  # bytes up to the end of the slot
-_LEAVING = 255
 
 POSITION_STEP = 0.002  # m, one step of a coordinate at the default extent
 EXTENT_M = 65.534  # m, default extent: 32767 steps, the largest coordinate that a frame can say
@@ -198,6 +197,5 @@ def named_in(data: bytes) -> tuple[int, int] | None:
 
 def condition_in(data: bytes) -> tuple[bool, bool, bool]:
     """Whether a frame's sender leaves, rests, is on probation; extended frames alone say the first and the last."""
-    if data[0] & 15 != PROFILE_EXTENDED:
-        return False, not data[3], False
-    return data[2] == _LEAVING, not data[3] & 1, bool(data[3] & 2)
+    found = lib.frame_condition_of(data)
+    return bool(found.leaves), bool(found.rests), bool(found.on_probation)

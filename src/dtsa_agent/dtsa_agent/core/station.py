@@ -24,13 +24,20 @@ VERDICTS = (
     "", "not ours", "length", "other settings", "no frame", "unknown agent", "rejected", "repeated", "other time",
     "own id", "too early",
 )  # fmt: skip
+LENGTH, OTHER_SETTINGS, NO_FRAME, REJECTED, REPEATED, OTHER_TIME, TOO_EARLY = (
+    VERDICTS[number]
+    for number in (
+        lib.DTSA_WRONG_LENGTH, lib.DTSA_OTHER_SETTINGS, lib.DTSA_NO_FRAME, lib.DTSA_REJECTED, lib.DTSA_REPEATED,
+        lib.DTSA_OTHER_TIME, lib.DTSA_TOO_EARLY,
+    )
+)  # fmt: skip
 STATES = ("listening", "alone", "joined")
 FLIES, LISTENS, IS_NEW, SAME_ID, NO_QUORUM = range(5)  # why an agent hovers
 ALL_BUT_ONE = "all-but-one"
 QUORUMS = f"{ALL_BUT_ONE}, a share of the others (80%), or a number of them (0: it never hovers for this)"
 FOR_EVER = 1 << 31  # slots
 KEEPS_NOTHING, KEEPS_NUMBERS, KEEPS_STARTS = range(3)  # slots move as the rules say; with frames that fit; never
-BETWEEN = 0.2  # of a slot, between a frame that left late and the next slot: clocks differ, nobody waits any longer
+BETWEEN = lib.DTSA_BETWEEN / 1000  # of a slot, between a frame that left late and the next slot
 EARLY_COUNT = 64  # frames of slots still to come that are kept
 
 
@@ -97,11 +104,6 @@ def check_joinable(policy: str) -> None:
     if not row.may_join or row.unslotted:
         joinable = [row.name for row in POLICIES.rows.values() if row.may_join]
         raise ConfigError("policy", policy, f"{', '.join(joinable)}, to come into a flight that is under way")
-
-
-def too_long_ns(config: SwarmConfig) -> int:
-    """After how long a stand-still an agent begins anew, ns: others may think it dead, and it knows too little."""
-    return max(500, 3 * config.anchor_every * config.agents) * config.slot_ns
 
 
 def parse_quorum(text: str) -> tuple[int, float]:
@@ -181,6 +183,7 @@ class StationSettings:
         })  # fmt: skip
         self.names = link.names
         self.length: int = lib.dtsa_datagram_length(self.c)  # of all datagrams, bytes
+        self.too_long_ns: int = lib.dtsa_station_too_long(self.c)  # a stand-still after which an agent restarts
 
     def read(self, data: bytes) -> ParsedDatagram:
         """What a datagram says."""
@@ -293,11 +296,6 @@ class Station:
     def slot_start_ns(self, slot: int) -> int:
         """When a slot starts; it may still move a little with what is heard."""
         return int(lib.dtsa_station_slot_start(self.c, slot))
-
-    def heard_ns(self, id: int) -> int | None:
-        """When the last frame of an agent arrived; None: none has."""
-        when = lib.dtsa_station_heard_ns(self.c, id)
-        return None if when == -(1 << 63) else when
 
     @property
     def status(self) -> Any:

@@ -35,7 +35,7 @@ const char *dtsa_config_fault(const dtsa_config *c)
     return c->lease.open_every < 0 ? "open_every" : NULL;
 }
 
-static uint64_t divisor(uint64_t a, uint64_t b)
+uint64_t common_factor(uint64_t a, uint64_t b)
 {
     while (b) {
         const uint64_t rest = a % b;
@@ -50,7 +50,7 @@ uint64_t dtsa_slot_cycle(const dtsa_config *c)
     const int rounds = c->lease.main_every ? c->lease.main_every : c->lease.anchor_every;
     const uint64_t turns = (uint64_t)c->agents * (uint64_t)(rounds > 0 ? rounds : 1) * 2,
                    open = c->lease.open_every > 0 ? (uint64_t)c->lease.open_every : 1,
-                   all = turns / divisor(turns, open) * open;
+                   all = turns / common_factor(turns, open) * open;
     return ((uint64_t)1 << 32) / all * all;
 }
 

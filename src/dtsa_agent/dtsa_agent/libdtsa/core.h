@@ -63,6 +63,9 @@ int select_urgent(const dtsa_config *config, const double *p, const double *v, c
 uint64_t mix64(uint64_t x);
 double draw_uniform(uint64_t key, uint64_t what); /* 0 or more, less than 1 */
 
+/* agent.c */
+uint64_t common_factor(uint64_t a, uint64_t b); /* the greatest */
+
 /* ---- an agent ---- */
 
 enum { PRESENT_LEAVING = 2 };

@@ -115,3 +115,11 @@ int frame_decode(const uint8_t *data, long length, double position_step, dtsa_fr
     if (f->profile == DTSA_PROFILE_PAPER && data[18] >> 4) return FRAME_BAD_FIELD;
     return FRAME_OK;
 }
+
+frame_condition frame_condition_of(const uint8_t *data)
+{
+    const int extended = (data[0] & 0xf) == DTSA_PROFILE_EXTENDED;
+    return (frame_condition){.leaves = extended && data[2] == FRAME_LEAVES,
+                             .rests = extended ? !(data[3] & 1) : !data[3],
+                             .on_probation = extended && data[3] >> 1 & 1};
+}

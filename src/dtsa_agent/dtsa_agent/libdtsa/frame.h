@@ -6,7 +6,7 @@
 
 #include "dtsa.h"
 
-enum { FRAME_VERSION = 1 };
+enum { FRAME_VERSION = 1, FRAME_LEAVES = 255 }; /* in byte 2 of extended frames */
 enum {
     SECTIONS = 3,
     SECTION_BYTES = 11,
@@ -48,6 +48,11 @@ typedef struct extended_frame {
     uint8_t far_mask[FAR_BYTES]; /* bit b: turn slot + RELAY_REACH + 1 + b is handed on to it */
 } extended_frame;
 
+/* What a frame says of its sender. Extended frames alone say that it leaves or is on probation. */
+typedef struct frame_condition {
+    int leaves, rests, on_probation;
+} frame_condition;
+
 /* ---- frame.c ---- */
 
 int frame_length(int profile); /* bytes, 0 for an unknown profile */
@@ -55,6 +60,8 @@ int frame_length(int profile); /* bytes, 0 for an unknown profile */
  * -> length, 0 if a field cannot be said. */
 int frame_encode(const dtsa_frame *frame, double position_step, uint8_t *out);
 int frame_decode(const uint8_t *data, long length, double position_step, dtsa_frame *frame);
+/* Of any frame with a header, unchecked. */
+frame_condition frame_condition_of(const uint8_t *data);
 /* Quantised fields, shared by all profiles; saturate, never wrap. */
 int64_t quantise(double value, double step, int bits);
 

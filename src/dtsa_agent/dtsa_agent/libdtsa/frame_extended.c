@@ -130,7 +130,7 @@ int extended_encode(const extended_frame *e, double position_step, uint8_t *out)
     int section = 0;
     if (!sayable(e) || !frame_encode(&e->own, position_step, out)) return 0;
     uint8_t *at = out + EXTENDED_HEAD;
-    out[2] = e->leaving ? 255 : (uint8_t)e->c_s;
+    out[2] = e->leaving ? FRAME_LEAVES : (uint8_t)e->c_s;
     for (int i = 0; i < e->lease_count; i += SECTION_BYTES, at += SECTION_BYTES) {
         if (section == SECTIONS) return 0;
         kinds[section++] = KIND_LEASES;
@@ -167,10 +167,10 @@ int extended_decode(const uint8_t *data, long length, double position_step, exte
     const int status = frame_decode(data, length, position_step, &e->own);
     if (status != FRAME_OK) return status;
     if (e->own.profile != DTSA_PROFILE_EXTENDED) return FRAME_BAD_HEADER;
-    e->leaving = data[2] == 255;
+    e->leaving = frame_condition_of(data).leaves;
     e->c_s = e->leaving ? 0 : data[2];
     if (e->c_s == 254) return FRAME_BAD_FIELD;
-    e->probation = data[3] >> 1 & 1;
+    e->probation = frame_condition_of(data).on_probation;
     e->gossip_count = e->lease_count = 0;
     e->relay_mask = 0;
     e->far_id = 0;

@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "core.h"
+#include "station/station.h"
 
 enum { WAKE, ARRIVE, BEGIN, END, INJECT, START, GOALS };
 enum { QUEUE_LENGTH = 64, HISTORY_LENGTH = 256, SPIN_LIMIT = 20000 };
@@ -59,7 +60,6 @@ typedef struct live {
         int length, sender;
         uint8_t data[DTSA_DATAGRAM_MAX];
     } history[HISTORY_LENGTH];
-    uint64_t sent;
     int64_t busy_until[LIVE_HOSTS_MAX]; /* by receiver: the medium is in use */
     event *last_arrival[LIVE_HOSTS_MAX];
     int64_t quorum_slack_ns;
@@ -102,7 +102,8 @@ static int is_before(const event *a, const event *b)
     return a->at != b->at ? a->at < b->at : a->order < b->order;
 }
 
-static event *push(live *v, int64_t at, int kind, int host)
+/* index: of a fault, or of a wake-up. NULL, and the flight has failed, where there is no memory. */
+static event *push(live *v, int64_t at, int kind, int host, int index)
 {
     if (v->count == v->room) {
         const int room = v->room ? 2 * v->room : 1024;
@@ -119,7 +120,7 @@ static event *push(live *v, int64_t at, int kind, int host)
     e->order = v->order++;
     e->kind = kind;
     e->host = host;
-    e->index = 0;
+    e->index = index;
     e->length = 0;
     int i = v->count++;
     for (; i && is_before(e, v->heap[(i - 1) / 2]); i = (i - 1) / 2)
@@ -162,9 +163,7 @@ static void tell(live *v, live_call call)
 
 static void note_bytes(live *v, const uint8_t *data, int length)
 {
-    uint64_t hash = v->r->hash;
-    for (int k = 0; k < length; k++) hash = (hash ^ data[k]) * 0x100000001b3ULL;
-    v->r->hash = (hash ^ (uint64_t)v->now) * 0x100000001b3ULL;
+    v->r->hash = (datagram_hash(v->r->hash, data, length) ^ (uint64_t)v->now) * HASH_PRIME;
 }
 
 static void deliver(live *v, int receiver, const uint8_t *data, int length, int64_t later)
@@ -183,7 +182,7 @@ static void deliver(live *v, int receiver, const uint8_t *data, int length, int6
         }
         v->busy_until[receiver] = at;
     }
-    event *e = push(v, at, ARRIVE, receiver);
+    event *e = push(v, at, ARRIVE, receiver, 0);
     if (!e) return;
     e->length = length;
     memcpy(e->data, data, (size_t)length);
@@ -217,16 +216,16 @@ static void send(live *v, int i, const uint8_t *data, int length)
     dtsa_station_status s;
     if (is_active(v, LIVE_REFUSE, i)) {
         dtsa_station_sent(h->station, clock_of(h, v->now), 0);
-        tell(v, (live_call){.host = i, .kind = 3, .now_ns = clock_of(h, v->now), .answer = 0});
+        tell(v,
+             (live_call){.host = i, .kind = LIVE_SENT, .now_ns = clock_of(h, v->now), .answer = 0});
         return;
     }
     dtsa_station_sent(h->station, clock_of(h, v->now), 1);
-    tell(v, (live_call){.host = i, .kind = 3, .now_ns = clock_of(h, v->now), .answer = 1});
+    tell(v, (live_call){.host = i, .kind = LIVE_SENT, .now_ns = clock_of(h, v->now), .answer = 1});
     note_bytes(v, data, length);
-    v->r->sent++;
-    memcpy(v->history[v->sent % HISTORY_LENGTH].data, data, (size_t)length);
-    v->history[v->sent % HISTORY_LENGTH].length = length;
-    v->sent++;
+    const uint64_t at = v->r->sent++ % HISTORY_LENGTH;
+    memcpy(v->history[at].data, data, (size_t)length);
+    v->history[at].length = length;
     dtsa_station_get_status(h->station, &s);
     h->sent_slot = s.slot;
     h->sent_at = v->now;
@@ -303,7 +302,7 @@ static void step(live *v, int i)
         v->r->steps++;
         dtsa_station_get_status(h->station, &after);
         tell(v, (live_call){.host = i,
-                            .kind = 2,
+                            .kind = LIVE_STEPPED,
                             .now_ns = now,
                             .answer = due,
                             .out = datagram,
@@ -317,21 +316,18 @@ static void step(live *v, int i)
             check_quorum(v, i);
         }
         if (due > now) {
-            event *e = push(v, time_of(h, due) + below(v, v->f->wake_ns), WAKE, i);
-            if (e) e->index = ++h->token;
+            push(v, time_of(h, due) + below(v, v->f->wake_ns), WAKE, i, ++h->token);
             return;
         }
     }
     violate(v, LIVE_SPINS, i, 0);
 }
 
-static int note_reception(live *v, int i, const uint8_t *data, int64_t arrival)
+static void note_reception(live *v, int i, const uint8_t *data)
 {
-    const dtsa_station_settings *c = &v->f->station;
-    const uint8_t *frame = data + (dtsa_datagram_length(c) - c->frame_length - (c->key ? 4 : 0));
-    const int id = c->extended ? frame[1] : frame[1] | frame[2] << 8;
-    if (id >= 1 && id <= v->n) v->host[i].received[id - 1] = arrival;
-    return id;
+    const uint8_t *frame = data + datagram_head(&v->f->station.link);
+    const int id = v->f->station.extended ? frame[1] : frame[1] | frame[2] << 8;
+    if (id >= 1 && id <= v->n) v->host[i].received[id - 1] = v->now;
 }
 
 static void receive(live *v, int i, const uint8_t *data, int length, int64_t at)
@@ -339,9 +335,9 @@ static void receive(live *v, int i, const uint8_t *data, int length, int64_t at)
     host *h = &v->host[i];
     const int64_t arrival = clock_of(h, at);
     const dtsa_verdict verdict = dtsa_station_receive(h->station, data, length, arrival);
-    if (verdict == DTSA_ACCEPTED) note_reception(v, i, data, v->now);
+    if (verdict == DTSA_ACCEPTED) note_reception(v, i, data);
     tell(v, (live_call){.host = i,
-                        .kind = 1,
+                        .kind = LIVE_RECEIVED,
                         .now_ns = arrival,
                         .data = data,
                         .length = length,
@@ -361,7 +357,7 @@ static void start(live *v, int i)
         return;
     }
     if (f->first_slot && !v->now) {
-        s.begins = 1;
+        s.begins = DTSA_BEGINS_TOGETHER;
         s.origin_ns = now + s.slot_ns - f->first_slot * s.slot_ns;
     }
     const dtsa_station_agent agent = dtsa_station_agent_of(h->agent);
@@ -373,14 +369,14 @@ static void start(live *v, int i)
     h->on = 1;
     h->queue_count = 0;
     h->sent_at = INT64_MIN / 2;
-    tell(v, (live_call){.host = i, .kind = 0, .now_ns = now, .answer = h->id});
+    tell(v, (live_call){.host = i, .kind = LIVE_STARTED, .now_ns = now, .answer = h->id});
     step(v, i);
 }
 
 static void stop(live *v, int i)
 {
     v->host[i].on = 0;
-    tell(v, (live_call){.host = i, .kind = 5});
+    tell(v, (live_call){.host = i, .kind = LIVE_ENDED});
 }
 
 static void wake(live *v, int i)
@@ -443,20 +439,20 @@ static void inject(live *v, int k)
     const live_fault *a = &v->f->faults[k];
     uint8_t data[DTSA_DATAGRAM_MAX];
     int length = dtsa_datagram_length(&v->f->station);
-    if (!v->sent || !(v->active >> k & 1)) return;
+    if (!v->r->sent || !(v->active >> k & 1)) return;
     if (a->kind == LIVE_REPLAY) {
-        const uint64_t kept = v->sent < HISTORY_LENGTH ? v->sent : HISTORY_LENGTH;
+        const uint64_t kept = v->r->sent < HISTORY_LENGTH ? v->r->sent : HISTORY_LENGTH;
         const int at = (int)below(v, (int64_t)kept);
         length = v->history[at].length;
         memcpy(data, v->history[at].data, (size_t)length);
     } else {
-        memcpy(data, v->history[(v->sent - 1) % HISTORY_LENGTH].data, (size_t)length);
-        uint8_t *frame = data + (length - v->f->station.frame_length - (v->f->station.key ? 4 : 0));
+        memcpy(data, v->history[(v->r->sent - 1) % HISTORY_LENGTH].data, (size_t)length);
+        uint8_t *frame = data + datagram_head(&v->f->station.link);
         frame[1] = (uint8_t)(1 + below(v, v->n));
         for (int i = 4; i < 8; i++) frame[i] = (uint8_t)draw(v);
     }
     broadcast(v, -1, data, length, 0);
-    push(v, v->now + (int64_t)(1e9 / a->amount), INJECT, 0)->index = k;
+    push(v, v->now + (int64_t)(1e9 / a->amount), INJECT, 0, k);
 }
 
 static void begin_fault(live *v, int k)
@@ -470,7 +466,7 @@ static void begin_fault(live *v, int k)
     if (a->kind == LIVE_CRASH && h->on) stop(v, a->agent);
     if (a->kind == LIVE_LEAVE && h->on) {
         dtsa_station_leave(h->station);
-        tell(v, (live_call){.host = a->agent, .kind = 4});
+        tell(v, (live_call){.host = a->agent, .kind = LIVE_LEFT});
     }
     if (a->kind == LIVE_SAME_ID && a->agent < v->n) {
         host *twin = &v->host[v->n + k % (v->hosts - v->n)];
@@ -494,10 +490,8 @@ static void end_fault(live *v, int k)
         const int twin = v->n + k % (v->hosts - v->n);
         if (v->host[twin].on) stop(v, twin);
     }
-    if ((a->kind == LIVE_SUSPEND || a->kind == LIVE_STALL || a->kind == LIVE_STEP) && h->on) {
-        event *e = push(v, v->now + 1000, WAKE, a->agent);
-        if (e) e->index = ++h->token;
-    }
+    if ((a->kind == LIVE_SUSPEND || a->kind == LIVE_STALL || a->kind == LIVE_STEP) && h->on)
+        push(v, v->now + 1000, WAKE, a->agent, ++h->token);
     apply(v);
     if (a->kind == LIVE_LEAVE && h->on) stop(v, a->agent);
     if ((a->kind == LIVE_CRASH || a->kind == LIVE_LEAVE) && !h->on) start(v, a->agent);
@@ -511,9 +505,10 @@ static void change_goals(live *v)
         const int there = (int)below(v, 2);
         const double *goal = there ? h->away : h->home;
         dtsa_agent_set_goal(h->agent, goal, 0);
-        tell(v, (live_call){.host = i, .kind = 6, .position = {goal[0], goal[1], goal[2]}});
+        tell(v, (live_call){
+                    .host = i, .kind = LIVE_NEW_GOAL, .position = {goal[0], goal[1], goal[2]}});
     }
-    push(v, v->now + v->f->goal_every_ns, GOALS, 0);
+    push(v, v->now + v->f->goal_every_ns, GOALS, 0, 0);
 }
 
 /* ---- a flight ---- */
@@ -525,12 +520,10 @@ static void run(live *v, int64_t until)
         host *h = &v->host[e->host];
         v->now = e->at;
         if (e->kind == WAKE && h->on && e->index == h->token) {
-            if (v->now < h->stalled_until) {
-                event *again = push(v, h->stalled_until + below(v, v->f->wake_ns), WAKE, e->host);
-                if (again) again->index = h->token;
-            } else {
+            if (v->now < h->stalled_until)
+                push(v, h->stalled_until + below(v, v->f->wake_ns), WAKE, e->host, h->token);
+            else
                 wake(v, e->host);
-            }
         }
         if (e->kind == ARRIVE) {
             if (v->last_arrival[e->host] == e) v->last_arrival[e->host] = NULL;
@@ -590,7 +583,7 @@ static int open_hosts(live *v)
             h->position[d] = h->home[d] = f->config.start[d * v->n + h->id - 1];
             h->away[d] = f->config.target[d * v->n + h->id - 1];
         }
-        if (i < v->n) push(v, given->start_ns, START, i);
+        if (i < v->n) push(v, given->start_ns, START, i, 0);
     }
     return !v->failed;
 }
@@ -621,7 +614,7 @@ int live_fly(const live_flight *f, live_result *r, live_observer observer, void 
 {
     live v = {.f = f, .r = r, .observer = observer, .context = context, .n = f->config.agents};
     const int64_t part = f->bound_ns / 64 + 1;
-    *r = (live_result){.together_ns = -1, .hash = 0xcbf29ce484222325ULL};
+    *r = (live_result){.together_ns = -1, .hash = HASH_START};
     v.hosts = v.n + 2;
     if (v.hosts > LIVE_HOSTS_MAX) return 0;
     v.random = f->seed;
@@ -630,10 +623,10 @@ int live_fly(const live_flight *f, live_result *r, live_observer observer, void 
     v.quorum_slack_ns = (6 + 2 * lists) * (int64_t)c->main_every * v.n * c->slot_ns;
     if (open_hosts(&v)) {
         for (int k = 0; k < f->fault_count; k++) {
-            push(&v, f->faults[k].at_ns, BEGIN, 0)->index = k;
-            push(&v, f->faults[k].at_ns + f->faults[k].lasts_ns, END, 0)->index = k;
+            push(&v, f->faults[k].at_ns, BEGIN, 0, k);
+            push(&v, f->faults[k].at_ns + f->faults[k].lasts_ns, END, 0, k);
         }
-        if (f->goal_every_ns) push(&v, f->goal_every_ns, GOALS, 0);
+        if (f->goal_every_ns) push(&v, f->goal_every_ns, GOALS, 0, 0);
         run(&v, f->heal_ns);
         for (int64_t t = f->heal_ns; t < f->heal_ns + f->bound_ns && r->together_ns < 0;
              t += part) {

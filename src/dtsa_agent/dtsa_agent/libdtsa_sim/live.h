@@ -79,9 +79,11 @@ typedef struct live_result {
     uint32_t restarts, shifts;
 } live_result;
 
+enum { LIVE_STARTED, LIVE_RECEIVED, LIVE_STEPPED, LIVE_SENT, LIVE_LEFT, LIVE_ENDED, LIVE_NEW_GOAL };
+
 /* A call of a station, for whoever makes them again: after it, its answer. */
 typedef struct live_call {
-    int host, kind; /* 0: started, 1: receive, 2: step, 3: sent, 4: leave, 5: ended, 6: goal */
+    int host, kind;
     int64_t now_ns;
     const uint8_t *data;
     long length;

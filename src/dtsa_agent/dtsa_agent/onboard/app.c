@@ -172,7 +172,7 @@ static const char *begin(int which, int64_t begins_ns)
         .key_length = KEY_BYTES,
         .session = session,
         .early_count = EARLY_COUNT,
-        .begins = begins_ns != 0,
+        .begins = begins_ns ? DTSA_BEGINS_TOGETHER : DTSA_BEGINS_LISTENING,
         .origin_ns = begins_ns,
         .link = {.header = {(uint8_t)headerWord, (uint8_t)(headerWord >> 8)},
                  .header_length = sealed ? 0 : 2,

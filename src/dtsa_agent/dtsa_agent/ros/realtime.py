@@ -47,6 +47,10 @@ from dtsa_agent.core.station import (
     KEEPS_NOTHING,
     KEEPS_NUMBERS,
     KEEPS_STARTS,
+    LENGTH,
+    NO_FRAME,
+    REJECTED,
+    REPEATED,
     Link,
     StationSettings,
     check_joinable,
@@ -69,9 +73,7 @@ _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
 _TRUST_NS = 1_000_000  # frames that are off by more do not move slots
 _BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
-_MALFORMED = ("length", "no frame")  # of the reasons for which a station refuses frames
-_REJECTED = "rejected"
-_REPEATED = "repeated"
+_MALFORMED = (LENGTH, NO_FRAME)  # of the reasons for which a station refuses frames
 
 
 class RealtimeNode(AgentsNode):
@@ -167,8 +169,8 @@ class RealtimeNode(AgentsNode):
         foreign = max(agent.swarm.foreign for agent in self.agents)
         for fault, count in self._dropped.items():
             malformed += count * (fault in _MALFORMED)
-            foreign += count * (fault not in (*_MALFORMED, _REJECTED))
-        rejected = self._dropped[_REJECTED]
+            foreign += count * (fault not in (*_MALFORMED, REJECTED))
+        rejected = self._dropped[REJECTED]
         return {
             "frame malformed": malformed, "frame foreign": foreign, "frame rejected": rejected, REFUSED: self._refused,
         }  # fmt: skip
@@ -317,7 +319,7 @@ class RealtimeNode(AgentsNode):
         self._reporter.add_heard(index, sender, slot, here, self._heard_ns)
 
     def _refuse(self, fault: str) -> None:
-        if fault == _REPEATED:  # it has it
+        if fault == REPEATED:  # it has it
             return
         self._refused += 1
         if fault:

@@ -15,7 +15,7 @@ from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_listener
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.core.station import StationSettings
+from dtsa_agent.core.station import OTHER_TIME, REPEATED, StationSettings
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 from dtsa_bench.recordings.merge.agent_recorder import about_port
@@ -106,8 +106,8 @@ class Sniffer:
             return 0, 0, fault
         # Of a group that lies behind, or the same frame once more.
         if slot <= self._judged:
-            return sender, slot, "other time"
-        return sender, slot, "repeated" if sender in self._slots.get(slot, {}) else ""
+            return sender, slot, OTHER_TIME
+        return sender, slot, REPEATED if sender in self._slots.get(slot, {}) else ""
 
     def summary(self) -> dict[str, Any]:
         """What was heard, and what was found."""

@@ -247,12 +247,6 @@ class Station:
         half = self.settings.slot_ns // 2
         return -half < self._apart(origin_ns, self.origin_ns) < half
 
-    def in_step(self, now: Ns) -> int:
-        """Agents heard lately in the own time, with itself."""
-        return 1 + sum(
-            self._is_recent(p, p.heard_ns, now) and self._is_same(p.origin_ns, self.origin_ns) for p in self.peers
-        )
-
     def _align(self, offset_ns: int) -> int:
         """By how much the own slots move: half the median of some frames' offsets."""
         self.offsets.append(offset_ns)

@@ -19,6 +19,9 @@
 extern "C" {
 #endif
 
+/* Of a slot, in thousandths, between a frame that left late and the next slot: clocks differ. */
+enum { DTSA_BETWEEN = 200 };
+
 enum { DTSA_DATAGRAM_MAX = 512, DTSA_HEADER_MAX = 8, DTSA_NAMES_MAX = 4 };
 
 /* What carries the datagrams; the same for all stations of a swarm. A datagram is the header, how
@@ -175,6 +178,8 @@ DTSA_API int dtsa_datagram_length(const dtsa_station_settings *settings);
 
 typedef struct dtsa_station dtsa_station;
 
+/* After how long a stand-still an agent restarts, ns: others may think it dead. */
+DTSA_API int64_t dtsa_station_too_long(const dtsa_station_settings *settings);
 DTSA_API size_t dtsa_station_bytes(const dtsa_station_settings *settings);
 /* In `memory`, aligned for doubles; NULL: too small, or settings are not usable. Settings are copied
  * but for the key. It listens, or begins where settings say so. */
@@ -198,7 +203,6 @@ DTSA_API int dtsa_station_awaits_frame(const dtsa_station *station, int64_t now_
 DTSA_API int dtsa_station_hovers(const dtsa_station *station);   /* DTSA_FLIES.. in this slot */
 DTSA_API int64_t dtsa_station_slot(const dtsa_station *station); /* -1: none yet */
 DTSA_API int64_t dtsa_station_slot_start(const dtsa_station *station, int64_t slot);
-DTSA_API int64_t dtsa_station_heard_ns(const dtsa_station *station, int id); /* INT64_MIN: never */
 DTSA_API void dtsa_station_get_status(const dtsa_station *station, dtsa_station_status *status);
 
 #ifdef __cplusplus

@@ -8,8 +8,8 @@
  * All agents of the swarm count that have not said that they leave, whether they are heard or not. */
 #include "station.h"
 
-/* Of an extended frame, see frame_extended.c; others have c_r at the same place. */
-enum { LEAVES = 255, MOVES = 1, PROBATION = 2, CYCLES = 8 };
+/* Of lists of one name each, after which an agent that was not named is not heard. */
+enum { CYCLES = 8 };
 
 int dtsa_names_hear(const dtsa_named *names, int count, int most, int agent)
 {
@@ -28,11 +28,11 @@ void contacts_hear(dtsa_station *s, const dtsa_datagram *d)
 {
     peer *p = &s->peers[d->sender - 1];
     const int names = s->settings.link.names;
-    const int extended = (d->frame[0] & 0xf) == DTSA_PROFILE_EXTENDED;
+    const frame_condition condition = frame_condition_of(d->frame);
     dtsa_named named[DTSA_NAMES_MAX];
     int count = 0;
-    p->left = extended && d->frame[2] == LEAVES;
-    p->resting = extended ? !(d->frame[3] & MOVES) || d->frame[3] & PROBATION : !d->frame[3];
+    p->left = (uint8_t)condition.leaves;
+    p->resting = condition.rests || condition.on_probation;
     if (!names) return;
     for (int i = 0; i < names; i++)
         if (d->names[i].id) named[count++] = d->names[i];

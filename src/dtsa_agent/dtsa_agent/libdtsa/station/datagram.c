@@ -104,9 +104,8 @@ int dtsa_datagram_write(const dtsa_station_settings *s, const uint8_t *frame, ui
 }
 
 /* FNV-1a: tells an echo of an own datagram from one of another sender with the same id. */
-uint64_t datagram_hash(const uint8_t *data, long length)
+uint64_t datagram_hash(uint64_t hash, const uint8_t *data, long length)
 {
-    uint64_t hash = 0xcbf29ce484222325ULL;
-    for (long i = 0; i < length; i++) hash = (hash ^ data[i]) * 0x100000001b3ULL;
+    for (long i = 0; i < length; i++) hash = (hash ^ data[i]) * HASH_PRIME;
     return hash;
 }

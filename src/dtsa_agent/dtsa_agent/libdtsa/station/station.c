@@ -7,10 +7,8 @@
 #include "station.h"
 
 /* Of a slot, in thousandths: an agent that has heard all it waits for decides so long before the slot
- * starts; one that waits for a frame only so long; and from the last moment at which a frame may still
- * leave until the next slot, since clocks differ. */
-enum { LEAD = 700, LATEST_LEAD = 200, BETWEEN = 200 };
-enum { LEAVES = 255 };
+ * starts; one that waits for a frame only so long. */
+enum { LEAD = 700, LATEST_LEAD = 200 };
 /* Where tables have to be equal it waits so long beyond the start, in thousandths and ns at most: a late
  * frame costs less than tables that differ. */
 enum { LONGEST_WAIT = 300, LONGEST_WAIT_NS = 3000000 };
@@ -59,6 +57,12 @@ static void lay_out(dtsa_station *s, uint8_t *at)
         s->peers[k] = (peer){.heard_ns = INT64_MIN, .near_ns = INT64_MIN, .last_slot = -1};
 }
 
+int64_t dtsa_station_too_long(const dtsa_station_settings *c)
+{
+    const int64_t rounds = (int64_t)c->anchor_every * c->agents;
+    return c->equal_tables ? INT64_MAX : larger(500, 3 * rounds) * c->slot_ns;
+}
+
 static void set_times(dtsa_station *s)
 {
     const dtsa_station_settings *c = &s->settings;
@@ -71,8 +75,8 @@ static void set_times(dtsa_station *s)
     s->lead_ns = share(slot, LEAD);
     s->latest_lead_ns = c->equal_tables ? -smaller(share(slot, LONGEST_WAIT), LONGEST_WAIT_NS)
                                         : share(slot, LATEST_LEAD);
-    s->latest_send_ns = larger(slot - c->link.flight_ns - share(slot, BETWEEN), slot / 10);
-    s->too_long_ns = c->equal_tables ? INT64_MAX : larger(500 * slot, 3 * anchors);
+    s->latest_send_ns = larger(slot - c->link.flight_ns - share(slot, DTSA_BETWEEN), slot / 10);
+    s->too_long_ns = dtsa_station_too_long(c);
 }
 
 /* A number that looks random. */
@@ -250,10 +254,10 @@ static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
                         datagram);
     s->frame_length = 0;
     s->sent_hashes[s->sent_index++ % SENT_HISTORY_LENGTH] =
-        datagram_hash(datagram, s->datagram_length);
+        datagram_hash(HASH_START, datagram, s->datagram_length);
     s->counts.sent++;
     s->has_sent = 1;
-    if (s->leaving && s->frame[2] == LEAVES) s->gone = 1;
+    if (s->leaving && frame_condition_of(s->frame).leaves) s->gone = 1;
     if (s->events.sent)
         s->events.sent(s->events.context, s->slot, datagram, s->datagram_length, now);
     return s->datagram_length;
@@ -291,7 +295,7 @@ static dtsa_verdict refuse(dtsa_station *s, dtsa_verdict verdict, const uint8_t 
 static dtsa_verdict hear_own_id(dtsa_station *s, const uint8_t *data, long length, int64_t arrival,
                                 int64_t apart)
 {
-    const uint64_t hash = datagram_hash(data, length);
+    const uint64_t hash = datagram_hash(HASH_START, data, length);
     for (int i = 0; i < SENT_HISTORY_LENGTH; i++)
         if (s->sent_hashes[i] == hash) return DTSA_REPEATED;
     if (apart >= s->settings.slot_ns / 2 || apart <= -s->settings.slot_ns / 2)
@@ -402,11 +406,6 @@ int dtsa_station_awaits_frame(const dtsa_station *s, int64_t now)
     const int64_t next = dtsa_station_slot_start(s, s->slot + 1);
     return s->state == DTSA_LISTENING ||
            (s->awaits && !s->frame_length && now >= next - s->lead_ns);
-}
-
-int64_t dtsa_station_heard_ns(const dtsa_station *s, int id)
-{
-    return id >= 1 && id <= s->settings.agents ? s->peers[id - 1].heard_ns : INT64_MIN;
 }
 
 void dtsa_station_get_status(const dtsa_station *s, dtsa_station_status *status)

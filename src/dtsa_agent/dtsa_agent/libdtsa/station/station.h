@@ -81,7 +81,9 @@ static inline int64_t floor_div(int64_t a, int64_t b) /* b > 0 */ { return a / b
 
 /* datagram.c */
 int datagram_head(const dtsa_link *link); /* bytes before the frame */
-uint64_t datagram_hash(const uint8_t *data, long length);
+/* Goes on with a hash; the first of all is HASH_START. */
+static const uint64_t HASH_START = 0xcbf29ce484222325ULL, HASH_PRIME = 0x100000001b3ULL;
+uint64_t datagram_hash(uint64_t hash, const uint8_t *data, long length);
 
 /* clock.c */
 enum { IN_STEP, SHIFTED, RESTARTED, OTHER };

@@ -17,7 +17,16 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_extended, decode_frame
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.core.station import EARLY_COUNT, ParsedDatagram, StationSettings, check_joinable, too_long_ns
+from dtsa_agent.core.station import (
+    EARLY_COUNT,
+    NO_FRAME,
+    OTHER_TIME,
+    REPEATED,
+    TOO_EARLY,
+    ParsedDatagram,
+    StationSettings,
+    check_joinable,
+)
 from dtsa_agent.keys import authenticator
 from dtsa_bench.pages.html import pack
 from dtsa_bench.recordings.merge.known_pairs import all_known_after
@@ -72,10 +81,10 @@ class HeardRun:
         :param zero_ns: ns, CLOCK_MONOTONIC, when slot 0 began by this frame.
         """
         if said.slot not in self._frames and len(self._frames) >= EARLY_COUNT:
-            return "too early"
+            return TOO_EARLY
         frames = self._frames.setdefault(said.slot, {})
         if said.sender in frames:
-            return "repeated"
+            return REPEATED
         frames[said.sender] = sealed, said.frame
         self.heard_ns = now_ns
         self._late_ns.append(said.late_ns)
@@ -168,7 +177,7 @@ class NetworkListener:
         link = link_of(config, port.properties)
         self._datagrams = StationSettings(config, link, authenticator(config))
         self._air, self._flight_ns = port.properties.name, link.flight_ns
-        self._too_long_ns = too_long_ns(config)
+        self._too_long_ns = self._datagrams.too_long_ns
         self._where = port.where
         self._listener = open_listener(port)
         self._run: HeardRun | None = None
@@ -192,11 +201,11 @@ class NetworkListener:
         if said.fault:
             return said.fault
         if not self._is_frame(said.frame):
-            return "no frame"
+            return NO_FRAME
         zero_ns = arrival_ns - self._flight_ns - said.late_ns - said.slot * self._config.slot_ns
         run = self._run
         if run is not None and said.slot < run.slot and now_ns - run.heard_ns < _SILENCE_NS:
-            return "other time"
+            return OTHER_TIME
         if run is None or said.slot < run.slot or run.zero_ns - zero_ns > self._too_long_ns:
             run = self._run = HeardRun(self._track, self._config, self._air, said.slot, zero_ns)
         return run.hear(said, frame_in(data, self._config), zero_ns, now_ns)

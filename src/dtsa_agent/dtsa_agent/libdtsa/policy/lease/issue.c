@@ -31,16 +31,6 @@ typedef struct {
     uint8_t *list;   /* (members) those able */
 } electorate;
 
-static int common_factor(int a, int b)
-{
-    while (b) {
-        const int rest = a % b;
-        a = b;
-        b = rest;
-    }
-    return a;
-}
-
 /* Slots of which one turn goes to those who wake: S turns of those that rest lie in so many; half
  * as many more where all of them are settled; OFTEN for each that wakes, if that is more. No factor
  * in common with n, or the same few owners would always pay. */
@@ -53,7 +43,7 @@ static int open_block(int every, const lease_scope *v, int resting, int settled)
         const int often = (int)(v->n / (OFTEN * v->a->wakers));
         block = often > 2 ? often : 2;
     }
-    while (common_factor(block, v->n) > 1) block++;
+    while (common_factor((uint64_t)block, (uint64_t)v->n) > 1) block++;
     return block;
 }
 
