@@ -10,8 +10,8 @@ from dtsa_dev.network.hosts import why_not
 from trials import Trial, under_way
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge, verified
+from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.merge.merge import Merge, verified
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
 _LONG_S = 30.0

@@ -24,10 +24,9 @@ import dtsa
 from dtsa_agent.air.datagram import link_of
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.station import StationSettings
-from dtsa_bench.recordings.merge.merge import Merge, verified
-from dtsa_bench.recordings.merge.merged_run import lay
-from dtsa_bench.recordings.merge.merged_writer import write
-from dtsa_bench.recordings.verify import verify_bag
+from dtsa_bench.log.merge.merge import Merge, verified
+from dtsa_bench.log.merged_bag import align, write_merged
+from dtsa_bench.log.verify.check import verify_bag
 from dtsa_channel_sim import ChannelConfig
 
 GROUP = ("239.1.2.3", 4567)
@@ -157,9 +156,9 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
     refused = {reason for counts in found["not_taken_in"].values() for reason in counts}
     assert {"other time", "repeated", "rejected"} <= refused
     whole = tmp_path / "whole"
-    write(whole, lay(merged, found), found)
+    write_merged(whole, align(merged, found), found)
     assert verify_bag(whole).to_dict()["difference"] is None
-    run = dtsa.read_bag(whole)
+    run = dtsa.open(whole)
     assert run.summary == found["flight"]
     assert run.frames.lost.sum() > 0
 

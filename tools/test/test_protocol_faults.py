@@ -12,9 +12,8 @@ from dtsa_dev.protocol.experiment import Event, Experiment, random_schedule
 
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.frame import ExtendedFrame, encode_extended
-from dtsa_bench.recordings.rules.judge import Judge
-from dtsa_bench.recordings.rules.ledger import Ledger
-from dtsa_bench.recordings.verify.result import Mismatch, Result
+from dtsa_bench.log.rules import Judge, Ledger
+from dtsa_bench.log.verify.result import Mismatch, Result
 from dtsa_channel_sim import ChannelConfig
 
 CHUNKS, RUNS, SLOTS = 11, 10, 2800  # 308 000 slots

@@ -27,11 +27,10 @@ from dtsa_agent.air.datagram import HEADER
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import VARIABLE
-from dtsa_bench.recordings.merge.agent_bag import AgentBag, read
-from dtsa_bench.recordings.merge.merge import Merge, verified
-from dtsa_bench.recordings.merge.merged_run import lay
-from dtsa_bench.recordings.merge.merged_writer import write
-from dtsa_bench.recordings.verify import verify_bag
+from dtsa_bench.log.agent_bag import AgentBag, read
+from dtsa_bench.log.merge.merge import Merge, verified
+from dtsa_bench.log.merged_bag import align, write_merged
+from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim import ChannelConfig
@@ -287,7 +286,7 @@ def fly(trial: Trial, directory: Path, disturb: Callable[[Any], None], **simulat
     found = merged.judge(*([] if airtime is None else [airtime.on_air_ns(HEADER + trial.swarm.frame_length)]))
     assert verified(found), (found["decisions_again"], found["turns"]["which"], found["frames_heard_not_as_sent"])
     assert found["flight"] is not None, "they never counted alike"
-    write(directory / WHOLE, lay(merged, found), found)
+    write_merged(directory / WHOLE, align(merged, found), found)
     checked = verify_bag(directory / WHOLE)
     assert checked.ok, checked.difference
     channel = {"loss": trial.channel["loss"], **simulators}

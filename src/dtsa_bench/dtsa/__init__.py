@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from dtsa_agent.core.plugins.table import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
     from dtsa_bench.drawing.palette import agent_colour
-    from dtsa_bench.recordings.bag.errors import BagError, UnusableBag
-    from dtsa_bench.recordings.verify import Difference
-    from dtsa_bench.recordings.verify import Result as Verification
+    from dtsa_bench.log.bag.errors import BagError, UnusableBag
+    from dtsa_bench.log.flight_log import FlightLog
+    from dtsa_bench.log.verify.result import Difference
+    from dtsa_bench.log.verify.result import Result as Verification
     from dtsa_bench.runs.config import RunConfig, RunLimits
     from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig, Verdict
 
     from . import env
-    from ._flight import Flight, run_config, simulate
+    from ._flights import open, run_config, simulate, verify
     from ._plots import plot_ages, plot_bars, plot_distances, plot_lines, plot_matrix, plot_trajectories
     from ._plugins import register
-    from ._recording import Recording, read_bag, verify
     from ._sweep import SweepResult, sweep
 
 __all__ = [
@@ -51,10 +51,9 @@ __all__ = [
     "Decision",
     "Difference",
     "DtsaError",
-    "Flight",
+    "FlightLog",
     "LocalProtocolError",
     "PluginError",
-    "Recording",
     "RemoteProtocolError",
     "RunConfig",
     "RunLimits",
@@ -68,13 +67,13 @@ __all__ = [
     "__version__",
     "agent_colour",
     "env",
+    "open",
     "plot_ages",
     "plot_bars",
     "plot_distances",
     "plot_lines",
     "plot_matrix",
     "plot_trajectories",
-    "read_bag",
     "register",
     "run_config",
     "simulate",
@@ -83,10 +82,9 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "dtsa._flight": ("Flight", "run_config", "simulate"),
+    "dtsa._flights": ("open", "run_config", "simulate", "verify"),
     "dtsa._plots": ("plot_ages", "plot_bars", "plot_distances", "plot_lines", "plot_matrix", "plot_trajectories"),
     "dtsa._plugins": ("register",),
-    "dtsa._recording": ("Recording", "read_bag", "verify"),
     "dtsa._sweep": ("SweepResult", "sweep"),
     "dtsa_agent.core": (
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "PluginError", "RemoteProtocolError",
@@ -94,10 +92,11 @@ _HOMES = {
     ),
     "dtsa_agent.core.plugins.entry_points": ("Table",),
     "dtsa_agent.core.registry": ("REASONS",),
-    "dtsa_bench.recordings.bag.errors": ("BagError", "UnusableBag"),
+    "dtsa_bench.log.bag.errors": ("BagError", "UnusableBag"),
     "dtsa_bench.drawing.palette": ("agent_colour",),
     "dtsa_bench.runs.config": ("RunConfig", "RunLimits"),
-    "dtsa_bench.recordings.verify": ("Difference", "Verification"),
+    "dtsa_bench.log.flight_log": ("FlightLog",),
+    "dtsa_bench.log.verify.result": ("Difference", "Verification"),
     "dtsa_channel_sim": ("Channel", "ChannelConfig", "ClockConfig", "Verdict"),
 }  # fmt: skip
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from dtsa_agent.core.errors import ConfigError
@@ -18,12 +17,9 @@ from dtsa_bench.drawing.flight_paths import paint
 from dtsa_bench.drawing.style import QUIET, colours, panels, style
 from dtsa_bench.experiments import charts
 from dtsa_bench.experiments.tables import CRASHED, MEASURES
+from dtsa_bench.log.flight_log import FlightLog
 
-from ._flight import Flight
-from ._recording import Recording
 from ._sweep import SweepResult
-
-Flown = Flight | Recording
 
 
 def _png(figure: Figure) -> bytes:
@@ -45,7 +41,7 @@ def _show_in_notebooks() -> None:
 _show_in_notebooks()
 
 
-def plot_trajectories(*flights: Flown, titles: Sequence[str] | None = None) -> Figure:
+def plot_trajectories(*flights: FlightLog, titles: Sequence[str] | None = None) -> Figure:
     """Paths of the movers from above: a panel a flight, rings where they start and discs where they end.
 
     :param flights: simulated or recorded flights.
@@ -64,7 +60,7 @@ def plot_trajectories(*flights: Flown, titles: Sequence[str] | None = None) -> F
     return figure
 
 
-def plot_distances(*flights: Flown, titles: Sequence[str] | None = None) -> Figure:
+def plot_distances(*flights: FlightLog, titles: Sequence[str] | None = None) -> Figure:
     """Smallest distance between any two agents over time, m over s; the dotted line is where two have crashed.
 
     :param flights: simulated or recorded flights, a line each.
@@ -75,7 +71,7 @@ def plot_distances(*flights: Flown, titles: Sequence[str] | None = None) -> Figu
     with style():
         figure, (axis,) = panels(1, width=5.6, height=3.6)
         for flight, name, shade in zip(flights, names, colours(list(range(len(flights)))), strict=True):
-            axis.plot(flight.time_s, _closest(flight.path), color=shade, label=name)
+            axis.plot(flight.distances["time_s"], flight.distances["distance_m"], color=shade, label=name)
         axis.axhline(flights[0].config.limits.collision_m, color=QUIET, linewidth=1, linestyle=":")
         axis.set(title="smallest distance [m]", xlabel="time [s]", ylim=(0, None))
         if len(flights) > 1:
@@ -83,21 +79,21 @@ def plot_distances(*flights: Flown, titles: Sequence[str] | None = None) -> Figu
     return figure
 
 
-def plot_ages(*recordings: Recording, titles: Sequence[str] | None = None) -> Figure:
+def plot_ages(*flights: FlightLog, titles: Sequence[str] | None = None) -> Figure:
     """Mean age of what the agents know of each other over time, slots over s.
 
-    :param recordings: recorded runs, a line each.
-    :param titles: one a run; None: policy and estimator.
-    :raises ConfigError: without a run, for a number of titles that does not fit, or if pandas is missing.
+    :param flights: simulated or recorded flights, a line each.
+    :param titles: one a flight; None: policy and estimator.
+    :raises ConfigError: without a flight, for a number of titles that does not fit, or if pandas is missing.
     """
-    names = _titles(recordings, titles)
+    names = _titles(flights, titles)
     with style():
         figure, (axis,) = panels(1, width=5.6, height=3.6)
-        for recording, name, shade in zip(recordings, names, colours(list(range(len(recordings)))), strict=True):
-            mean = recording.ages.groupby("time_s")["age_slots"].mean()
+        for flight, name, shade in zip(flights, names, colours(list(range(len(flights)))), strict=True):
+            mean = flight.ages.groupby("time_s")["age_slots"].mean()
             axis.plot(mean.index, mean.to_numpy(), color=shade, label=name)
         axis.set(title="mean age [slots]", xlabel="time [s]", ylim=(0, None))
-        if len(recordings) > 1:
+        if len(flights) > 1:
             axis.legend()
     return figure
 
@@ -155,7 +151,7 @@ def _chart(result: SweepResult, draw: Any, y: str | Sequence[str], **roles: str 
     return figure
 
 
-def _titles(flights: Sequence[Flown], titles: Sequence[str] | None) -> list[str]:
+def _titles(flights: Sequence[FlightLog], titles: Sequence[str] | None) -> list[str]:
     if not flights:
         raise ConfigError("flights", 0, "at least one")
     if titles is not None:
@@ -163,12 +159,3 @@ def _titles(flights: Sequence[Flown], titles: Sequence[str] | None) -> list[str]
             raise ConfigError("titles", list(titles), f"{len(flights)}, one a flight")
         return list(titles)
     return [f"{flight.config.swarm.policy}, {flight.config.swarm.estimator}" for flight in flights]
-
-
-def _closest(path: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """(T,) m, smallest distance of any two at each instant."""
-    closest = np.full(len(path), np.inf)
-    for k in range(path.shape[2] - 1):
-        between = np.linalg.norm(path[:, :, k + 1 :] - path[:, :, k : k + 1], axis=1)
-        closest = np.fmin(closest, np.nanmin(between, axis=1, initial=np.inf))
-    return closest

@@ -8,7 +8,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.environment import MeanAge, Observer, Reward, SlotResults, SwarmEnv, fields
 
-from ._flight import run_config
+from ._flights import run_config
 
 __all__ = ["MeanAge", "Observer", "Reward", "SlotResults", "SwarmEnv", "fields", "parallel_env"]
 

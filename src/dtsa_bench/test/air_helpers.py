@@ -25,15 +25,13 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
+from dtsa_bench.log.agent_bag import AgentRecorder, read
+from dtsa_bench.log.merge.merge import Merge, verified
+from dtsa_bench.log.merged_bag import MergedFlight, align, write_merged
+from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.network.sniffer import Sniffer
 from dtsa_bench.pages.view.network_listener import NetworkListener
 from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
-from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
-from dtsa_bench.recordings.merge.merge import Merge, verified
-from dtsa_bench.recordings.merge.merged_run import MergedRun, lay
-from dtsa_bench.recordings.merge.merged_writer import write
-from dtsa_bench.recordings.verify import verify_bag
 
 _PATIENCE_S = 60.0
 Own = Callable[[int], dict[str, Any]]  # settings of an agent, by its id
@@ -192,12 +190,12 @@ def listening(config: SwarmConfig, settings: PortSettings) -> Iterator[Callable[
         thread.join()
 
 
-def merge_bags(paths: Iterable[Path], whole: Path) -> tuple[MergedRun, dict[str, Any]]:
+def merge_bags(paths: Iterable[Path], whole: Path) -> tuple[MergedFlight, dict[str, Any]]:
     """The merged run, and what was found of it; its bag is written to `whole`."""
     together = Merge([read(path) for path in paths])
     merged = together.judge()
-    run = lay(together, merged)
-    write(whole, run, merged)
+    run = align(together, merged)
+    write_merged(whole, run, merged)
     return run, merged
 
 

@@ -18,17 +18,17 @@ from rosbags.typesys.store import Typestore
 
 from dtsa_agent.core import REASONS, Swarm, SwarmConfig
 from dtsa_bench.flights.domain import ros_domain
-from dtsa_bench.recordings.bag import schema
-from dtsa_bench.recordings.bag.cdr import MarkerPacker, OdometryPacker
-from dtsa_bench.recordings.bag.errors import BagError
-from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.bag.writer import BagWriter
+from dtsa_bench.log.bag import schema
+from dtsa_bench.log.bag.cdr import MarkerPacker, OdometryPacker
+from dtsa_bench.log.bag.errors import BagError
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.log.record import FORMAT, FORMAT_KEY, SLOT_RECORD, TYPE, frame_fields, pack_record
 from dtsa_bench.runs.config import RunConfig
 
 MESSAGES = Path(__file__).parents[2] / "dtsa_msgs" / "msg"
 RUN = 0x1234  # id of all synthetic runs
 SECOND = 1_000_000_000
-_FLIGHT = ("Transmission", "Reception", "Decision")
 
 
 @cache
@@ -64,7 +64,7 @@ def header(time_ns: int) -> Any:
 class SyntheticRun:
     """A flight of the real core on a seeded channel that loses frames, recorded slot by slot.
 
-    :param whole: record slot messages and markers, too.
+    :param whole: record messages of the graph and markers, too, as another recorder might.
     :param options: of `BagWriter`.
     """
 
@@ -76,11 +76,13 @@ class SyntheticRun:
         self._random, self._start = np.random.default_rng(config.seed), self._swarm.position.copy()
         self._next = 0
         self._delivery: dict[str, Any] = dict.fromkeys(("sender", "length", "data", "received"), np.zeros(0, np.uint8))
+        options["custom_data"] = {FORMAT_KEY: FORMAT} | options.get("custom_data", {})
         self.writer = BagWriter(directory, RunConfig(config).to_dict(), **options)
         self.written: dict[str, list[tuple[int, int, bytes]]] = {}
         self._channels: dict[str, int] = {}
-        swarm_topics = ("Slot", "Transmission", "Reception", "Decision") if whole else _FLIGHT
-        topics = [(f"/swarm/{name.lower()}", f"dtsa_msgs/msg/{name}", "reliable") for name in swarm_topics]
+        swarm_topics = ("Slot", "Transmission", "Reception", "Decision") if whole else ()
+        topics = [(SLOT_RECORD, TYPE, "reliable")]
+        topics += [(f"/swarm/{name.lower()}", f"dtsa_msgs/msg/{name}", "reliable") for name in swarm_topics]
         topics += [("/swarm/markers", "visualization_msgs/msg/MarkerArray", "reliable")] * whole
         topics += [(f"/cf{i}/odom", "nav_msgs/msg/Odometry", "sensor_data") for i in self._ids]
         for topic, kind, qos in topics:
@@ -101,13 +103,24 @@ class SyntheticRun:
         """Record what the agents say at the start of a slot."""
         swarm, start = self._swarm, SECOND + slot * self.config.slot_ns
         lengths = [len(swarm.frame(k)) if len(data) else 0 for k in range(self.config.agents)]
-        track = swarm.track if slot else np.repeat(self._start[None], self.config.steps, 0)
+        track = swarm.track.copy() if slot else np.repeat(self._start[None], self.config.steps, 0)
+        self._begin = {
+            "agent": self._ids, "track": track, "velocity": swarm.velocity.copy(), "command": swarm.command.copy(),
+            "goal": swarm.goal.copy(),
+            **{name: getattr(swarm, name).copy() for name in ("chosen", "reason", "digest", "score")},
+        }  # fmt: skip
         self._write(
             "/swarm/transmission", start, start, slot=slot, agent=self._ids, length=np.array(lengths, np.uint8),
             data=data, offset_ns=np.zeros(0, np.int64), chosen=swarm.chosen, reason=swarm.reason, digest=swarm.digest,
             score=swarm.score, steps=self.config.steps, track=track.ravel(), velocity=swarm.velocity.ravel(),
             command=swarm.command.ravel(), goal=swarm.goal.ravel() if slot == 0 else np.zeros(0),
         )  # fmt: skip
+
+    def end(self, slot: int) -> None:
+        """Record where all are at the end."""
+        at = SECOND + slot * self.config.slot_ns
+        record = pack_record(RUN, slot, at, self.config.steps, agent=self._ids, track=self._swarm.track)
+        self._write(SLOT_RECORD, at, at, record)
 
     def slot(self, slot: int) -> None:
         """Fly the next slot, and record it as that of a number."""
@@ -141,6 +154,12 @@ class SyntheticRun:
         }  # fmt: skip
         lost = np.array([n - 1 - heard[0].sum()] if alone else [0] * len(senders), np.uint16)
         collided = np.array([0] if alone else [n - 1] * len(senders), np.uint16)
+        record = pack_record(
+            RUN, slot, start, self.config.steps, min(2, len(senders)), **self._begin,
+            **frame_fields(dict(zip(sender.tolist(), frames, strict=True)), heard.astype(np.bool_)), lost=lost,
+            collided=collided,
+        )  # fmt: skip
+        self._write(SLOT_RECORD, start, start, record)
         self._write(
             "/swarm/reception", end, end, slot=slot, outcome=min(2, len(senders)), sender=sender, received=received,
             lost=lost, collided=collided,
@@ -172,8 +191,7 @@ def flight_bag(directory: Path, slots: int = 400, loss: float = 0.0, **settings:
     with run.writer:
         for slot in range(slots):
             run.slot(slot)
-        # The last slot is answered too: with it the agents say where they are at its end.
-        run.answer(slots, np.zeros(0, np.uint8))
+        run.end(slots)
 
 
 _HELD = ExitStack()

@@ -17,9 +17,10 @@ from typing import Any
 from waiting import wait_for
 
 from dtsa_agent.ros.common.wire.packing import split_frames
-from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.bag.recover import recover
-from dtsa_bench.recordings.verify import Result, verify_bag
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.recover import recover
+from dtsa_bench.log.verify.check import verify_bag
+from dtsa_bench.log.verify.result import Result
 
 PATIENCE_S = 180.0
 ENDLESS = ("--tail-s", "3600", "--no-picture")  # of simulated time, long enough to be disturbed

@@ -17,9 +17,9 @@ import numpy as np
 from bag_helpers import flight_bag
 
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
+from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.pages.view.follower import Follower
 from dtsa_bench.pages.view.track import Track
-from dtsa_bench.recordings.bag.reader import Bag
 
 SLOTS, AGENTS = 150, 6
 PATIENCE_S = 60.0

@@ -18,7 +18,7 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[3]
 if str(ROOT / "tools") not in sys.path:
     sys.path.insert(0, str(ROOT / "tools"))
-from dtsa_bench.recordings.tables.columns import describe  # noqa: E402
+from dtsa_bench.log.tables import describe  # noqa: E402
 from dtsa_dev.documents import pages, tables  # noqa: E402
 
 #: Pages that stand at the top of the repository, and where they are on the site.

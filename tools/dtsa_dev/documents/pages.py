@@ -17,9 +17,9 @@ from . import table
 _TYPES = Path(__file__).resolve().parents[3] / "src" / "dtsa_msgs"
 _SETTINGS = ("RunConfig", "SwarmConfig", "ChannelConfig", "ClockConfig", "RunLimits")
 _GROUPS = {
-    "One flight": ("simulate", "run_config", "Flight"),
+    "One flight": ("simulate", "run_config", "FlightLog"),
     "Many flights": ("sweep", "SweepResult"),
-    "Recorded runs": ("read_bag", "Recording", "verify", "Verification", "Difference"),
+    "Recorded runs": ("open", "verify", "Verification", "Difference"),
     "What a plug-in is given": ("register", "Table"),
     "Figures": (*(name for name in dtsa.__all__ if name.startswith("plot_")), "agent_colour"),
     "One agent, one channel": ("Agent", "Decision", "SlotOutcome", "Channel", "Verdict"),

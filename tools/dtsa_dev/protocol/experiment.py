@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_bench.recordings.rules.ledger import Ledger
+from dtsa_bench.log.rules import Ledger
 from dtsa_channel_sim import Channel, ChannelConfig
 
 RADIUS, TURN = 2.0, 0.5  # m, rad/s: those that move fly circles, at 1 m/s

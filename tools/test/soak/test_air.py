@@ -18,8 +18,7 @@ from trials import WHOLE, Trial, apart, fly
 
 from dtsa_agent.air.datagram import NETWORK
 from dtsa_agent.core import SwarmConfig
-from dtsa_bench.recordings.bag.run import load_run
-from dtsa_bench.recordings.tables.ages import follow_run
+from dtsa_bench.log.record import load_log
 
 pytestmark = [pytest.mark.soak, pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")]
 AGENTS = 12
@@ -72,7 +71,7 @@ def _fly(directory: Path, seed: int, slot_ms: float, loss: float, fault: str = "
     begins, lasts = (round(time_s / swarm.slot_s) for time_s in (FLIGHT_S / 3, FAULT_S))
     schedule = [{"slot": begins, "until": begins + lasts, **ON_THE_AIR[fault]}] if fault in ON_THE_AIR else []
     found = fly(trial, directory, lambda flight: _disturb(flight, fault), schedule=tuple(schedule))
-    assert follow_run(load_run(directory / WHOLE)).summary == found["flight"]
+    assert load_log(directory / WHOLE).summary == found["flight"]
     assert len(found["medium"]["heard_at_the_end"]) == AGENTS
     return found
 

@@ -21,8 +21,8 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import sanitizer_environment
 from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
-from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge
+from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.merge.merge import Merge
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1800)]
 AGENTS, ENABLED_S = 12, 8.0

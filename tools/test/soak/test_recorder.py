@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from fly_helpers import ENDLESS, FlightProcess, start_flight
 
-from dtsa_bench.recordings.bag.recover import Recovery, recover
-from dtsa_bench.recordings.verify import verify_bag
+from dtsa_bench.log.bag.recover import Recovery, recover
+from dtsa_bench.log.verify.check import verify_bag
 
 pytestmark = [pytest.mark.ros, pytest.mark.soak]
 LOST_S = 1.0  # s of wall time that may be lost at most

@@ -107,7 +107,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
 
 def _is_verified(key: str, bag: Path) -> bool:
     """Verify a bag and print a line about it."""
-    from dtsa_bench.recordings.verify import verify_bag
+    from dtsa_bench.log.verify.check import verify_bag
 
     result = verify_bag(bag)
     if result.ok:

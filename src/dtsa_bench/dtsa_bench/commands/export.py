@@ -8,7 +8,7 @@ import sys
 
 from .registry import RECORDED_RUN
 
-TABLES = ("slots", "frames", "receptions", "decisions", "states", "ages", "ages_by_observer")
+TABLES = ("slots", "frames", "receptions", "decisions", "states", "ages", "ages_by_observer", "distances")
 DESCRIPTION = """\
 Writes a recorded run as tables for pandas and polars: slots, frames, who received them, decisions, states, ages and
 errors (of each agent; of each agent in the eyes of each observer), one file each, and columns.md, which says what each
@@ -30,12 +30,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export the bag."""
-    from dtsa_bench.recordings.bag.place import bag_of
-    from dtsa_bench.recordings.tables.export import export
+    from dtsa_bench.log.bag.place import bag_of
+    from dtsa_bench.log.merged_bag import open_log
+    from dtsa_bench.log.tables import export
 
     bag = bag_of(args.bag).resolve()
     target = args.out or bag.with_name(f"{bag.name if bag.is_dir() else bag.stem}_tables")
-    written = export(args.bag, target, args.to, args.tables, note=lambda text: print(f"dtsa: {text}", file=sys.stderr))
+    written = export(
+        lambda: open_log(args.bag), target, args.to, args.tables, lambda text: print(f"dtsa: {text}", file=sys.stderr)
+    )
     if args.json:
         print(json.dumps([{"path": str(table.path), "rows": table.rows} for table in written], indent=2))
         return 0

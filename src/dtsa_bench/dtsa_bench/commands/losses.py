@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Learn, and print what came of it."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.recordings.losses import learn
+    from dtsa_bench.log.losses import learn
 
     if args.out and (Path(args.out).exists() or not Path(args.out).parent.is_dir()):
         raise ConfigError("out", args.out, "a new file in a directory that exists")

@@ -33,21 +33,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Merge, and print what came of it."""
-    from dtsa_bench.recordings.merge.agent_bag import read_all
-    from dtsa_bench.recordings.merge.merge import Merge, clocks_apart, verified
+    from dtsa_bench.log.agent_bag import read_all
+    from dtsa_bench.log.merge.merge import Merge, clocks_apart, verified
     from dtsa_bench.runs.options import number
 
     out = Path(args.out) if args.out else None
     if out is not None:
-        from dtsa_bench.recordings.merge.merged_run import lay
-        from dtsa_bench.recordings.merge.merged_writer import check_free, write
+        from dtsa_bench.log.merged_bag import align, check_free, write_merged
 
         check_free(out)
     air_ns = round(number(args.air_us, "air_us", 0, 1e6, "us") * 1e3)
     merged = Merge(*read_all(args.bags))
     summary = merged.judge(air_ns)
     if out is not None:
-        write(out, lay(merged, summary), summary)
+        write_merged(out, align(merged, summary), summary)
     text = json.dumps(summary, indent=2) + "\n"
     print(text if args.json else "\n".join(lines(summary)) + "\n", end="")
     if summary["unheard"]:

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Recover the bag."""
-    from dtsa_bench.recordings.bag.recover import recover
+    from dtsa_bench.log.bag.recover import recover
 
     result = recover(args.bag, args.out)
     if args.json:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from .registry import RECORDED_RUN
 
 if TYPE_CHECKING:
-    from dtsa_bench.recordings.bag.replay import Player
+    from dtsa_bench.log.bag.replay import Player
 
 DESCRIPTION = """\
 Publishes a recorded run: the recorded bytes on the recorded topics with the recorded QoS, in time, and
@@ -50,8 +50,8 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_agent.core.errors import ConfigError
     from dtsa_agent.ros.common.process.node_process import init_ros
     from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
-    from dtsa_bench.recordings.bag.reader import Bag
-    from dtsa_bench.recordings.bag.replay import Player, RosOutput
+    from dtsa_bench.log.bag.reader import Bag
+    from dtsa_bench.log.bag.replay import Player, RosOutput
 
     if not 0 <= args.delay <= 3600:
         raise ConfigError("delay", args.delay, "0 to 3600 s")

@@ -29,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Listen until Ctrl-C, and print what came of it."""
     from dtsa_agent.stop import Stop
+    from dtsa_bench.log.bag.errors import BagError
     from dtsa_bench.network.sniffer import Sniffer
-    from dtsa_bench.recordings.bag.errors import BagError
     from dtsa_bench.runs.options import new_directory, number
 
     from .merge import lines

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Verify the bags."""
-    from dtsa_bench.recordings.verify import verify_bag
+    from dtsa_bench.log.verify.check import verify_bag
 
     live = sys.stderr.isatty()
 

@@ -1,4 +1,4 @@
 """Flights with real nodes: starts the channel and the agents, watches over them, ends them all.
 
-It imports `recordings`, `simulation` and `runs`.
+It imports `log`, `simulation` and `runs`.
 """

@@ -50,8 +50,8 @@ from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 from dtsa_agent.ros.common.workarounds.kept_nodes import keep_node
 from dtsa_agent.stop import StopToken
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
+from dtsa_bench.runs.metrics import may_share
 from dtsa_bench.runs.options import new_directory
-from dtsa_bench.simulation.simulate import may_share
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.observer import ChannelObserver

@@ -1,31 +1,41 @@
-"""Writes a flight into a bag: every message that went over the graph, and what follows from them, slot by slot."""
+"""Writes a flight into a bag: a record a slot, and what viewers show, 20 times a simulated second."""
 
 from __future__ import annotations
 
 import json
+from collections import deque
 from pathlib import Path
+from typing import Any
 
-from dtsa_msgs.msg import RunStatus
+import numpy as np
+from dtsa_msgs.msg import Frame, RunStatus
+from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterType
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
+from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_agent.ros.common.wire.report_fields import ReportFields
-from dtsa_bench.recordings.bag.cdr import CdrBuilder, OdometryPacker
-from dtsa_bench.recordings.bag.metadata import RUN_ID
-from dtsa_bench.recordings.bag.writer import BagWriter
+from dtsa_agent.ros.common.wire.stamps import ns_of
+from dtsa_bench.log.bag.cdr import CdrBuilder, OdometryPacker
+from dtsa_bench.log.bag.metadata import RUN_ID
+from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.log.record import FORMAT, FORMAT_KEY, SLOT_RECORD, TYPE, frame_fields, pack_record
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import Change
-from dtsa_channel_sim.model.verdict import Verdict
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.run_topics import RunState, configuration_message
 
 from .slot_messages import SlotMessages
 
-_MARKER_RECORD_NS = 100_000_000  # simulated time from one picture of the swarm to the next
+_VIEW_NS = 50_000_000  # simulated time from one picture of the swarm to the next
+_WAIT_NS = 1_000_000_000  # for so long the record of a slot in real time waits for reports that are late
+_DECIDED = {"chosen": np.uint16, "reason": np.uint8, "digest": np.uint32, "score": np.float64}
+_VECTORS = ("velocity", "command", "goal")
 
 
 class FlightRecorder(ChannelObserver):
@@ -38,36 +48,27 @@ class FlightRecorder(ChannelObserver):
     """
 
     def __init__(self, directory: Path, run: RunConfig, scenario: Scenario, run_id: int) -> None:
-        self._slot_ns = run.swarm.slot_ns
-        self._marker_slots = max(1, round(_MARKER_RECORD_NS / self._slot_ns))
+        self._slot_ns, self._steps, self._run_id = run.swarm.slot_ns, run.swarm.steps, run_id
+        self._view_slots = max(1, round(_VIEW_NS / self._slot_ns))
         self._packed = SlotMessages(scenario, self._slot_ns, run_id)
         agents = run.swarm.agents
-        self.bag = BagWriter(
-            directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed), RUN_ID: f"{run_id:08x}"}, marked=True
-        )
+        custom = {"seed": str(run.swarm.seed), RUN_ID: f"{run_id:08x}", FORMAT_KEY: FORMAT}
+        self.bag = BagWriter(directory, run.to_dict(), custom_data=custom, marked=True)
         add = self.bag.add_topic
-        self._slot = add(f"{names.SWARM}/{names.SLOT}", "dtsa_msgs/msg/Slot")
-        self._transmission = add(f"{names.SWARM}/{names.TRANSMISSION}", "dtsa_msgs/msg/Transmission")
-        self._reception = add(f"{names.SWARM}/{names.RECEPTION}", "dtsa_msgs/msg/Reception")
-        self._decision = add(f"{names.SWARM}/{names.DECISION}", "dtsa_msgs/msg/Decision")
+        self._record = add(SLOT_RECORD, TYPE)
         self._markers = add(f"{names.SWARM}/{names.MARKERS}", "visualization_msgs/msg/MarkerArray")
         self._status = add(f"{names.SWARM}/{names.STATUS}", "dtsa_msgs/msg/RunStatus", "latched")
         settings = add(f"{names.SWARM}/{names.CONFIGURATION}", "dtsa_msgs/msg/Configuration", "latched")
         self._event = 0
-        self._realtime = run.mode != LOCKSTEP
-        if self._realtime:
-            self._frame = add(f"{names.SWARM}/{names.AIR_FRAME}", "dtsa_msgs/msg/Frame")
-            self._report = add(f"{names.SWARM}/{names.REPORT}", "dtsa_msgs/msg/Report")
-        self._frames: dict[int, list[tuple[bytes, int]]] = {}
         spaces = [names.agent_namespace(agent) for agent in range(1, agents + 1)]
         self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
         self._packer = OdometryPacker([f"{space[1:]}/base_link" for space in spaces], names.FRAME)
-        self._messages: dict[int, list[tuple[bytes, int]]] = {}
-        self._answers: dict[int, list[tuple[bytes, bytes]]] = {}
+        self._accounts = None if run.mode == LOCKSTEP else RealtimeAccounts(agents, self._steps, self._slot_ns)
+        self._ids = np.arange(1, agents + 1, dtype=np.uint16)
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1
-        self._complete = -1  # last slot that all have answered
-        self._begun: Answers | None = None  # what they answered
+        self._complete = -1  # last slot that all have answered,
+        self._answered, self._track = np.zeros(agents, np.bool_), np.zeros((self._steps, 3, agents))  # and who, where
         self._state = RunState(run_id, self._slot_ns)
         told = bytes(serialize_message(configuration_message(run.to_dict(), run_id)))
         self.bag.write(settings, told, names.TIME_ZERO_NS, names.TIME_ZERO_NS)
@@ -76,23 +77,19 @@ class FlightRecorder(ChannelObserver):
         """Simulated time at which a slot starts, ns."""
         return names.slot_time_ns(slot, self._slot_ns)
 
-    def slot_published(self, slot: int, data: bytes, time_ns: int) -> None:
-        self._messages.setdefault(slot, []).append((data, time_ns))
-
-    def answer_received(self, slot: int, ids: bytes, data: bytes) -> None:
-        self._answers.setdefault(slot, []).append((ids, data))
-
     def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
-        self._frames.setdefault(slot, []).append((data, time_ns))
+        if self._accounts is not None:
+            message = deserialize_message(data, Frame)
+            start_ns = ns_of(message.header.stamp) - names.TIME_ZERO_NS
+            self._accounts.add_frame(message.slot, message.agent, bytes(message.data), start_ns)
 
     def report(self, message: ReportFields, data: bytes) -> None:
-        if len(message.slot):
-            at = self._time_ns(int(message.slot[-1]))
-            self.bag.write(self._report, data, at, at)
+        if self._accounts is not None:
+            self._accounts.add_report(message)
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         self._complete = slot
-        self._begun = answers
+        self._answered[:], self._track[:] = answers.answered, answers.track
         if not slot:
             self._state.phase = RunStatus.FLYING
             self._write_status()
@@ -114,46 +111,47 @@ class FlightRecorder(ChannelObserver):
         at = self._time_ns(self._state.slot)
         self.bag.write(self._status, bytes(serialize_message(self._state.message())), at, at)
 
-    def _write_messages(self, slot: int) -> None:
-        """Writes a slot's own message and all answers to it, in the order of their ids."""
-        at = self._time_ns(slot)
-        for data, time_ns in self._frames.pop(slot, []):
-            self.bag.write(self._frame, data, time_ns, time_ns)
-        for data, time_ns in self._messages.pop(slot, []):
-            self.bag.write(self._slot, data, time_ns, time_ns)
-        for _, answer in sorted(self._answers.pop(slot, [])):
-            self.bag.write(self._transmission, answer, at, at)
-
     def _write_pending(self) -> None:
-        """Writes all about the slot before the last one that was answered."""
-        if self._pending_slot < self._complete:
-            # What came too late for its own slot is written with the next one.
-            for slot in sorted(
-                slot for slot in {*self._messages, *self._answers, *self._frames} if slot <= self._pending_slot
-            ):
-                self._write_messages(slot)
+        """Write all about the slot before the last one that was answered."""
+        if self._pending and self._pending_slot < self._complete:
             for channel, data, at in self._pending:
                 self.bag.write(channel, data, at, at)
-            if self._pending:  # before that no slot is complete
-                self.bag.mark()
             self._pending = []
+            if self._accounts is not None:
+                self._write_accounts(self._accounts, self._pending_slot)
+            self.bag.mark()
 
-    def _keep_reports(self, slot: int, answers: Answers) -> None:
-        """In real time: what has been reported for a slot, kept as one transmission."""
-        if self._realtime and answers.answered.any():
-            self._answers[slot] = [(b"", self._packed.transmission(slot, answers))]
+    def _write_accounts(self, accounts: RealtimeAccounts, closed: int, at_end: bool = False) -> None:
+        """Write the records of slots in real time for which nothing is waited for any more."""
+        for slot, fields in accounts.pop(closed, at_end):
+            self._write_record(slot, pack_record(self._run_id, slot, self._time_ns(slot), self._steps, **fields))
+
+    def _write_record(self, slot: int, data: bytes) -> None:
+        at = self._time_ns(slot)
+        self.bag.write(self._record, data, at, at)
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self._write_pending()
-        self._keep_reports(slot, answers)  # as its decisions: more may have come since all had answered
-        begin, end = self._time_ns(slot), self._time_ns(slot + 1)
-        motion = self._packer.pack(begin, answers.position, answers.velocity)
+        at = self._time_ns(slot)
         self._pending_slot = slot
-        self._pending = [(self._decision, self._packed.decision(slot, answers), begin)]
-        self._pending += [(channel, data, begin) for channel, data in zip(self._odometry, motion, strict=True)]
-        self._pending.append((self._reception, self._packed.reception(slot, verdict), end))
-        if slot % self._marker_slots == 0:
-            self._pending.append((self._markers, self._packed.markers(slot, answers, verdict), begin))
+        if self._accounts is None:
+            self._pending.append((self._record, self._lockstep_record(slot, answers, verdict), at))
+        else:
+            self._accounts.judge(verdict)
+        if slot % self._view_slots == 0:
+            motion = self._packer.pack(at, answers.position, answers.velocity)
+            self._pending += [(channel, data, at) for channel, data in zip(self._odometry, motion, strict=True)]
+            self._pending.append((self._markers, self._packed.markers(slot, answers, verdict), at))
+
+    def _lockstep_record(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
+        frames = {sender: answers.frames[sender] for sender in verdict.senders}
+        nothing = [0] * len(frames)
+        received = verdict.mask(len(self._ids)) if frames else None
+        account = {name: getattr(answers, name) for name in (*_DECIDED, "track", *_VECTORS)}
+        return pack_record(
+            self._run_id, slot, self._time_ns(slot), self._steps, verdict.outcome, agent=self._ids, **account,
+            **frame_fields(frames, received), lost=verdict.lost or nothing, collided=verdict.collided or nothing,
+        )  # fmt: skip
 
     def settings_changed(self, change: Change) -> None:
         if not self._event:  # the topic is in the bags of such flights only
@@ -162,15 +160,142 @@ class FlightRecorder(ChannelObserver):
         self.bag.write(self._event, _parameter_event(at, f"{names.SWARM}/channel", change), at, at)
 
     def close(self) -> None:
-        """Writes what is complete and finishes the bag."""
-        if self._begun is not None and self._complete > self._pending_slot:
-            self._keep_reports(self._complete, self._begun)
+        """Write what is complete and finish the bag."""
         self._write_pending()
-        for slot in sorted({*self._messages, *self._answers, *self._frames}):
-            if slot <= self._complete:
-                self._write_messages(slot)
+        if self._complete >= 0:
+            if self._accounts is not None:
+                self._write_accounts(self._accounts, self._complete - 1, at_end=True)
+            here = np.flatnonzero(self._answered)
+            place = {"agent": here + 1, "track": self._track[:, :, here]}
+            end = pack_record(self._run_id, self._complete, self._time_ns(self._complete), self._steps, **place)
+            self._write_record(self._complete, end)
         self._write_status()
         self.bag.close()
+
+
+class _Account:
+    """What is known of one slot in real time."""
+
+    def __init__(self, agents: int, steps: int) -> None:
+        self.known = np.zeros(agents, np.bool_)
+        kinds = _DECIDED | {"offset_ns": np.int64}
+        self.decided = {name: np.zeros(agents, kind) for name, kind in kinds.items()}
+        self.track = np.zeros((steps, 3, agents))
+        self.vectors = {name: np.zeros((3, agents)) for name in _VECTORS}
+        self.frames: dict[int, _Frame] = {}  # by sender
+        self.heard: list[tuple[int, int, int, NDArray[np.bool_]]] = []  # sender, its slot, ns, (N,) by whom
+
+
+class _Frame:
+    """A frame in real time, and what became of it."""
+
+    def __init__(self, data: bytes, start_ns: int) -> None:
+        self.data, self.start_ns = data, start_ns
+        self.verdict: tuple[NDArray[np.bool_], int, int] | None = None  # (N,) received, lost, collided
+
+
+class RealtimeAccounts:
+    """Slots of which not all is known yet, by what agents report and the channel decides."""
+
+    def __init__(self, agents: int, steps: int, slot_ns: int) -> None:
+        self._agents, self._steps, self._slot_ns = agents, steps, slot_ns
+        self._wait = max(2, _WAIT_NS // slot_ns)
+        self._open: dict[int, _Account] = {}
+        self._next = 0  # first slot that is not written
+        self._unjudged: dict[int, deque[_Frame]] = {}  # by sender
+
+    def _account(self, slot: int) -> _Account | None:
+        """The account of a slot; None if it is written already."""
+        if slot < self._next:
+            return None
+        if slot not in self._open:
+            self._open[slot] = _Account(self._agents, self._steps)
+        return self._open[slot]
+
+    def add_frame(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
+        """A frame goes on the air."""
+        frame = _Frame(data, start_ns)
+        self._unjudged.setdefault(sender, deque()).append(frame)
+        account = self._account(slot)
+        if account is not None:
+            account.frames.setdefault(sender, frame)
+
+    def judge(self, verdict: Verdict) -> None:
+        """The channel has judged frames, those of each sender in the order in which they were sent."""
+        mask = verdict.mask(self._agents)
+        nothing = (0,) * len(verdict.senders)
+        for row, sender in enumerate(verdict.senders):
+            if waiting := self._unjudged.get(sender):
+                lost, collided = (values[row] for values in (verdict.lost or nothing, verdict.collided or nothing))
+                waiting.popleft().verdict = mask[row], lost, collided
+
+    def add_report(self, message: ReportFields) -> None:
+        """Agents of one process report slots, and what they took in."""
+        at, count = np.array(message.agent, np.intp) - 1, len(message.agent)
+        for row, slot in enumerate(message.slot.tolist()):
+            account = self._account(slot)
+            if account is None or account.known[at].any():
+                continue  # too late, or told twice
+            account.known[at] = True
+            part = slice(row * count, (row + 1) * count)
+            for name, values in account.decided.items():
+                values[at] = getattr(message, name)[part]
+            account.track[:, :, at] = _plane(message.track, row, self._steps, count)
+            for name, values in account.vectors.items():
+                values[:, at] = _plane(getattr(message, name), row, 1, count)[0]
+        if len(message.heard_sender):
+            masks = np.unpackbits(message.heard_by.reshape(-1, -(-count // 8)), axis=1, count=count, bitorder="little")
+            columns = message.heard_in, message.heard_sender, message.heard_slot, message.heard_ns
+            for here, sender, slot, at_ns, mask in zip(*(c.tolist() for c in columns), masks, strict=True):
+                account = self._account(here)
+                if account is not None:
+                    by = np.zeros(self._agents, np.bool_)
+                    by[at] = mask
+                    account.heard.append((sender, slot, at_ns, by))
+
+    def pop(self, closed: int, at_end: bool) -> list[tuple[int, dict[str, Any]]]:
+        """The fields of records for which nothing is waited for any more, by slot.
+
+        :param closed: last slot that the channel has judged.
+        :param at_end: nothing more will come.
+        """
+        found = []
+        while self._next <= closed and (at_end or self._next <= closed - self._wait or self._is_whole(self._next)):
+            account = self._open.pop(self._next, None) or _Account(self._agents, self._steps)
+            found.append((self._next, self._fields(self._next, account)))
+            self._next += 1
+        return found
+
+    def _is_whole(self, slot: int) -> bool:
+        """Whether all agents have reported a slot, and what they took in during it, and its frames are judged."""
+        here, after = self._open.get(slot), self._open.get(slot + 1)
+        if here is None or after is None or not (here.known.all() and after.known.all()):
+            return False
+        return all(frame.verdict is not None for frame in here.frames.values())
+
+    def _fields(self, slot: int, account: _Account) -> dict[str, Any]:
+        start_ns, here = slot * self._slot_ns, np.flatnonzero(account.known)
+        frames = {agent: frame for agent, frame in sorted(account.frames.items()) if frame.verdict is not None}
+        verdicts = [frame.verdict for frame in frames.values() if frame.verdict is not None]
+        received = np.array([verdict[0] for verdict in verdicts]) if verdicts else None
+        heard = account.heard
+        return {
+            "outcome": (COLLISION if any(v[2] for v in verdicts) else SUCCESS) if verdicts else IDLE,
+            "agent": here + 1, **{name: values[here] for name, values in account.decided.items()},
+            "track": account.track[:, :, here], **{name: v[:, here] for name, v in account.vectors.items()},
+            **frame_fields({agent: frame.data for agent, frame in frames.items()}, received),
+            "sent_ns": [frame.start_ns - start_ns for frame in frames.values()],
+            "lost": [verdict[1] for verdict in verdicts], "collided": [verdict[2] for verdict in verdicts],
+            "heard_sender": [entry[0] for entry in heard], "heard_slot": [entry[1] for entry in heard],
+            "heard_ns": [entry[2] - start_ns for entry in heard],
+            "heard_by": np.frombuffer(pack_received(np.array([e[3] for e in heard])), np.uint8) if heard else [],
+        }  # fmt: skip
+
+
+def _plane(values: NDArray[np.float64], row: int, steps: int, count: int) -> NDArray[np.float64]:
+    """Vectors of a row, (steps, 3, n)."""
+    size = 3 * steps * count
+    return values[row * size : (row + 1) * size].reshape(steps, 3, count)
 
 
 def _parameter_event(time_ns: int, node: str, change: Change) -> bytes:

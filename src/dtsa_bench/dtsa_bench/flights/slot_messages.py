@@ -6,19 +6,16 @@ from array import array
 from functools import lru_cache
 
 import numpy as np
-from dtsa_msgs.msg import Decision, Reception, Transmission
+from dtsa_msgs.msg import Decision, Reception
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.serialization import serialize_message
-from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from dtsa_agent.core import REASONS, Scenario
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.cdr import Message
 from dtsa_agent.ros.common.wire.packing import pack_received
-from dtsa_agent.ros.common.wire.stamps import header_of
-from dtsa_bench.recordings.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPacker
+from dtsa_bench.log.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPacker
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
@@ -51,31 +48,6 @@ class SlotMessages:
         self._ids = array("H", range(1, self._agents + 1)).tobytes()
         self._reasons: dict[bytes, tuple[list[bytes], bytes]] = {}
         self._markers = MarkerPacker([f"cf{agent}" for agent in range(1, self._agents + 1)])
-
-    def _header(self, slot: int) -> Header:
-        return header_of(names.slot_time_ns(slot, self._slot_ns))
-
-    def transmission(self, slot: int, answers: Answers) -> bytes:
-        """A dtsa_msgs/Transmission as CDR, of all agents that have reported for a slot in real time."""
-        here = np.flatnonzero(answers.answered)
-        frames = [answers.frames.get(int(index) + 1, b"") for index in here]
-        planes = {name: getattr(answers, name)[..., here] for name in ("track", "velocity", "command", "goal")}
-        message = Transmission(
-            header=self._header(slot),
-            run=self._run_id,
-            slot=slot,
-            agent=array("H", (here + 1).astype(np.uint16).tobytes()),
-            length=array("B", [len(frame) for frame in frames]),
-            data=array("B", b"".join(frames)),
-            offset_ns=array("q", answers.offset_ns[here].tobytes()),
-            chosen=array("H", answers.chosen[here].tobytes()),
-            reason=array("B", answers.reason[here].tobytes()),
-            digest=array("I", answers.digest[here].tobytes()),
-            score=array("d", answers.score[here].tobytes()),
-            steps=answers.steps,
-            **{name: array("d", values.tobytes()) for name, values in planes.items()},
-        )
-        return bytes(serialize_message(message))
 
     def decision(self, slot: int, answers: Answers) -> bytes:
         """A dtsa_msgs/Decision as CDR."""

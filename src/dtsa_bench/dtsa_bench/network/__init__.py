@@ -1,4 +1,4 @@
 """Agents on a real network: their flight and its record, and a listener that judges what is on the air.
 
-It imports `recordings` and `runs`.
+It imports `log` and `runs`.
 """

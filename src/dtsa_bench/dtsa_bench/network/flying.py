@@ -69,7 +69,7 @@ def fly(job: AgentJob) -> int:
             agent.run(stop)
             summary = agent.summary()
         else:
-            from dtsa_bench.recordings.merge.agent_recorder import recorded
+            from dtsa_bench.log.agent_bag import recorded
 
             with recorded(job.out, agent, job.port) as recorder:
                 agent.run(stop)
@@ -86,7 +86,7 @@ def fly(job: AgentJob) -> int:
     if problem:
         say(problem)
     if failure:
-        from dtsa_bench.recordings.bag.errors import BagError
+        from dtsa_bench.log.bag.errors import BagError
 
         raise BagError(failure)
     return int(bool(problem))

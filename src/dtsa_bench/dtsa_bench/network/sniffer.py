@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import select
 import time
@@ -17,24 +18,16 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.station import OTHER_TIME, REPEATED, StationSettings
 from dtsa_agent.keys import authenticator
+from dtsa_agent.ros.common.graph import names
 from dtsa_agent.stop import Stop
-from dtsa_bench.recordings.merge.agent_recorder import about_port
-from dtsa_bench.recordings.merge.json_bag import JsonBag, described
-from dtsa_bench.recordings.rules.judge import Judge
+from dtsa_bench.log.agent_bag import RecordFile
+from dtsa_bench.log.record import SNIFFER, frame_fields, pack_record
+from dtsa_bench.log.rules import Judge
+from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS
 
-FRAME, METADATA = "frame", "dtsa_sniffer"  # topic of the frames in its bag, name of the metadata record
-FRAME_SCHEMA = described(
-    "dtsa.SniffedFrame",
-    arrival_ns=("integer", "when it arrived, ns, CLOCK_MONOTONIC"),
-    sender=("integer", "id that it names; 0: it was no frame of this swarm"),
-    slot=("integer", "slot that it names"),
-    data=("string", "the datagram, hexadecimal"),
-    reason=("string", "why it is no frame of this swarm; empty: it is one"),
-)
 _PATIENCE_S = 0.05
 _BURST = 64
 _WAITS = 2  # slots that are kept open for frames that come late
-_MOST_REFUSED = 50  # recorded from one flush to the next
 
 
 class Sniffer:
@@ -55,16 +48,16 @@ class Sniffer:
     ) -> None:
         self._config, self._judge = config, Judge(config)
         self._datagrams = StationSettings(config, link_of(config, port.properties), authenticator(config))
-        self._slots: dict[int, dict[int, bytes]] = {}  # not judged yet
+        self._slots: dict[int, dict[int, tuple[int, bytes]]] = {}  # not judged yet: by sender, when it came, and what
         self._judged = -1  # last slot
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
-        self._kept = 0  # refused datagrams since the last flush
+        self._zero_ns = time.monotonic_ns()
         self._listener: Any = open_listener(port)
         self._listener.say = say
-        about = {"swarm": json.dumps(config.to_dict(), sort_keys=True), **about_port(port)}
+        about = {"port": dataclasses.asdict(port.properties), "port_settings": port.to_dict(), "zero_ns": self._zero_ns}
         try:
-            self.bag = None if path is None else JsonBag(path, {FRAME: FRAME_SCHEMA}, METADATA, about)
+            self.bag = None if path is None else RecordFile(path, config, {SNIFFER: json.dumps(about, sort_keys=True)})
         except DtsaError:
             self._listener.__exit__()
             raise
@@ -79,26 +72,33 @@ class Sniffer:
             select.select([self._listener], [], [], _PATIENCE_S)
             for datagram in self._listener.receive(_BURST):
                 self._take(datagram.data, datagram.arrival_ns)
-            if self.bag is not None and self.bag.flush_if_due():
-                self._kept = 0
         for slot in sorted(self._slots):
-            self._judge.slot(slot, self._slots[slot])
-        self._slots.clear()
+            self._close_slot(slot)
 
     def _take(self, data: bytes, arrival_ns: int) -> None:
         sender, slot, reason = self._read(data)
-        if self.bag is not None and (not reason or self._kept < _MOST_REFUSED):
-            self._kept += bool(reason)
-            said = {"arrival_ns": arrival_ns, "sender": sender, "slot": slot, "data": data.hex(), "reason": reason}
-            self.bag.write(FRAME, arrival_ns, said)
         if reason:
             self.refused[reason] += 1
             return
         self.heard[sender] += 1
-        self._slots.setdefault(slot, {})[sender] = frame_in(data, self._config)
+        self._slots.setdefault(slot, {})[sender] = arrival_ns, frame_in(data, self._config)
         for over in sorted(s for s in self._slots if s <= max(self._slots) - _WAITS):
-            self._judge.slot(over, self._slots.pop(over))
+            self._close_slot(over)
             self._judged = over
+
+    def _close_slot(self, slot: int) -> None:
+        """Judge a slot, and record it: its time is that of the first frame that was heard in it."""
+        heard = dict(sorted(self._slots.pop(slot).items()))
+        frames = {sender: data for sender, (_, data) in heard.items()}
+        self._judge.slot(slot, frames)
+        if self.bag is not None:
+            first_ns = min(at_ns for at_ns, _ in heard.values())
+            at, nothing = first_ns - self._zero_ns + names.TIME_ZERO_NS, [0] * len(heard)
+            outcome = COLLISION if len(heard) > 1 else SUCCESS
+            self.bag.write(at, pack_record(
+                self._config.auth_session or 1, slot, at, self._config.steps, outcome, **frame_fields(frames, None),
+                sent_ns=[at_ns - first_ns for at_ns, _ in heard.values()], lost=nothing, collided=nothing,
+            ))  # fmt: skip
 
     def _read(self, data: bytes) -> tuple[int, int, str]:
         fault, sender, slot, *_ = self._datagrams.read(data)
@@ -122,7 +122,7 @@ class Sniffer:
         """Ends the record, and leaves the air."""
         self._listener.__exit__()
         if self.bag is not None:
-            self.bag.__exit__()
+            self.bag.close()
 
     def __enter__(self) -> Sniffer:
         return self

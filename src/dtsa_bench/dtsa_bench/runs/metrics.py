@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
@@ -42,6 +42,31 @@ def metrics_tables(run: RunConfig, scenario: Scenario, everyone: bool) -> Swarm:
     """
     observers = list(range(1, run.swarm.agents + 1)) if everyone else [0]
     return with_key(make_swarm(run.swarm, scenario, local=[], observers=observers))
+
+
+def may_share(run: RunConfig) -> bool:
+    """Whether one table may stand for all agents: nothing is ever lost, and all would decide the same.
+
+    In slots that a frame may outlast the channel names each frame's receivers, for which one table has no room.
+
+    :param run: the run.
+    """
+    air, swarm = run.air, run.swarm
+    lossless = not (
+        air.loss
+        or air.burst_length
+        or air.p_good
+        or air.jam
+        or air.partition
+        or air.range_m
+        or air.capture_db
+        or air.loss_matrix
+        or air.link_loss
+        or air.losses
+        or air.schedule
+        or air.airtime.total_ns(air.airtime.longest) > air.slot_ns
+    )
+    return lossless and shareable(swarm)
 
 
 class FlightMetrics:

@@ -7,17 +7,19 @@ for bit.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm, make_scenario
-from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
+from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
+from dtsa_bench.log.arrays import LogBuilder
+from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.runs.config import RunConfig
-from dtsa_bench.runs.metrics import FlightMetrics
+from dtsa_bench.runs.metrics import FlightMetrics, may_share
 from dtsa_channel_sim import Channel
 
 from .slotted import SlottedTraffic
@@ -56,6 +58,7 @@ class Flight:
     swarm: Swarm  # as it was at the end
     trace: Trace | None
     wall_time_s: float
+    log: FlightLog | None = None
 
     def summary(self) -> dict[str, Any]:
         """The results, with the keys of ``summary.json``."""
@@ -64,37 +67,13 @@ class Flight:
         return result
 
 
-def may_share(run: RunConfig) -> bool:
-    """Whether one table may stand for all agents: nothing is ever lost, and all would decide the same.
-
-    In slots that a frame may outlast the channel names each frame's receivers, for which one table has no room.
-
-    :param run: the run.
-    """
-    air, swarm = run.air, run.swarm
-    lossless = not (
-        air.loss
-        or air.burst_length
-        or air.p_good
-        or air.jam
-        or air.partition
-        or air.range_m
-        or air.capture_db
-        or air.loss_matrix
-        or air.link_loss
-        or air.losses
-        or air.schedule
-        or air.airtime.total_ns(air.airtime.longest) > air.slot_ns
-    )
-    return lossless and shareable(swarm)
-
-
 def simulate(
     run: RunConfig,
     *,
     shared_table: bool | None = None,
     trace: bool = False,
     observer: int = 1,
+    log: bool = False,
 ) -> Flight:
     """Flies one run.
 
@@ -102,6 +81,7 @@ def simulate(
     :param shared_table: one table for all agents; None: where :func:`may_share` allows it.
     :param trace: keep what happened in every slot.
     :param observer: id whose table the trace follows.
+    :param log: keep what happened to all agents in every slot.
     """
     begun = time.perf_counter()
     scenario = make_scenario(run.swarm)
@@ -110,11 +90,24 @@ def simulate(
     swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared))
     metrics = FlightMetrics(run, scenario)
     fly = _fly_unslotted if run.swarm.policy_row.unslotted else _fly
-    fly(swarm, Channel(run.air), metrics, kept, observer)
-    return Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
+    builder = LogBuilder(run) if log else None
+    fly(swarm, Channel(run.air), metrics, kept, observer, builder)
+    flight = Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
+    return (
+        flight
+        if builder is None
+        else replace(flight, log=FlightLog(**builder.fields(swarm.track), results=flight.summary()))
+    )
 
 
-def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int) -> None:
+def _fly(
+    swarm: Swarm,
+    channel: Channel,
+    metrics: FlightMetrics,
+    kept: Trace | None,
+    observer: int,
+    log: LogBuilder | None,
+) -> None:
     """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
     advance, begin, update = swarm.scenario.advance, swarm.begin, metrics.update
     carry, track = SlottedTraffic(swarm, channel).slot, swarm.track
@@ -126,7 +119,11 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | N
         senders = begin(slot)
         if compare is not None:
             compare(slot, swarm.digest, swarm.chosen)
+        if log is not None:
+            log.open(swarm, {swarm.ids[index]: swarm.frame(index) for index in senders})
         verdict, lengths = carry(slot, senders)
+        if log is not None:
+            log.close(verdict)
         over = update(slot, track, swarm, verdict.outcome, lengths)
         if kept is not None:
             _keep(kept, swarm, slot, verdict.senders, verdict.outcome, table)
@@ -135,7 +132,14 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | N
         slot += 1
 
 
-def _fly_unslotted(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int) -> None:
+def _fly_unslotted(
+    swarm: Swarm,
+    channel: Channel,
+    metrics: FlightMetrics,
+    kept: Trace | None,
+    observer: int,
+    log: LogBuilder | None,
+) -> None:
     """The same for agents that send at any instant: what arrives in a slot is heard in it."""
     traffic = UnslottedTraffic(swarm, channel)
     slot, over = 0, ""
@@ -143,11 +147,15 @@ def _fly_unslotted(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept:
         swarm.scenario.advance(slot, swarm)
         carried = traffic.slot(slot)
         metrics.compare_tables(slot, swarm.digest, swarm.chosen)
+        heard = [*((slot, frame, mask) for frame, mask in carried.heard), *carried.combined]
+        if log is not None:
+            log.open(swarm, {agent: swarm.frame(agent - 1) for agent in carried.senders})
+            for at, frame, mask in heard:
+                log.hear(at, frame, mask)
+            log.close_unslotted(carried.outcome, carried.senders, heard)
         swarm.fly(slot)
-        for frame, mask in carried.heard:
-            swarm.hear(slot, frame, mask)
-        for sampled, frame, mask in carried.combined:
-            swarm.hear(sampled, frame, mask)
+        for at, frame, mask in heard:
+            swarm.hear(at, frame, mask)
         swarm.end(slot)
         over = metrics.update(slot, swarm.track, swarm, carried.outcome, carried.lengths)
         if kept is not None:

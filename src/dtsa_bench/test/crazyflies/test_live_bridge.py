@@ -30,8 +30,8 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
 from dtsa_agent.keys import VARIABLE
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
-from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge, verified
+from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.merge.merge import Merge, verified
 
 pytestmark = [
     pytest.mark.slow, pytest.mark.ros, pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler"),

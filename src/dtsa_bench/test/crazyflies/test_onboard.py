@@ -17,8 +17,8 @@ from dtsa_bench.commands.cli import main
 from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import FIRMWARE, compiler
 from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
-from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge, verified
+from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.merge.merge import Merge, verified
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 

@@ -20,7 +20,7 @@ from dtsa_bench.commands.cli import main
 from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.domain import clear_hindrances, ros_domain
 from dtsa_bench.flights.flight import fly as fly_here
-from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim import ChannelConfig, ClockConfig, make_clocks
 

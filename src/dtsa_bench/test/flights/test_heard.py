@@ -31,10 +31,10 @@ from dtsa_agent.core.authentication import TAG_LENGTH
 from dtsa_agent.core.reference.frame import LENGTHS
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.keys import VARIABLE
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.record import load_log
+from dtsa_bench.log.tables import export
 from dtsa_bench.pages.report.data import run_data
-from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.bag.run import load_run
-from dtsa_bench.recordings.tables.export import export
 
 pytestmark = pytest.mark.ros
 
@@ -99,7 +99,7 @@ def check_heard(out: Path, summary: dict[str, Any], own_bytes: int, sealed: bool
     assert summary["age_mean_slots"] is not None
     assert not verified(out).unheard
     with Bag(out) as bag:
-        run = load_run(bag)
+        run = load_log(bag)
     heard = np.zeros((AGENTS, AGENTS), dtype=bool)
     for sender, received in zip(run.frames.sender, run.frames.received, strict=True):
         heard[sender - 1] |= received
@@ -148,7 +148,7 @@ def test_agents_on_a_network_hear_each_other(tmp_path: Path, kind: str) -> None:
     assert merged.returncode == 0, merged.stderr
     verified(tmp_path / "whole")
     with Bag(tmp_path / "whole") as bag:
-        lengths = {len(data) for data in load_run(bag).frames.data if data}
+        lengths = {len(data) for data in load_log(bag).frames.data if data}
     tag = TAG_LENGTH if "--auth" in words else 0
     assert lengths <= {length + own_bytes + tag for length in LENGTHS.values()}, lengths
 

@@ -30,8 +30,8 @@ from dtsa_agent.core.frame import ExtendedFrame, encode_extended
 from dtsa_agent.core.settings.config import agreed_settings, settings_hash
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.stamps import header_of
-from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.verify import verify_bag
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.verify.check import verify_bag
 
 pytestmark = pytest.mark.ros
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from bag_helpers import ros_environment
 
-from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.verify.check import verify_bag
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.verify.check import verify_bag
 
 pytest.importorskip("launch_ros", reason="no `ros2 launch` on this machine: it comes with an installation of ROS 2")
 pytest.importorskip("dtsa_msgs", reason="the workspace is not built")

@@ -13,7 +13,7 @@ from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.log.bag.reader import Bag
 from dtsa_channel_sim import ClockConfig, make_clocks
 
 pytestmark = pytest.mark.ros

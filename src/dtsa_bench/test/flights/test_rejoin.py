@@ -17,7 +17,7 @@ from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import decode_extended
 from dtsa_agent.core.reference.lease.memory import Memory
 from dtsa_agent.core.reference.rules import Rules
-from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_bench.runs.metrics import COMPLETED, CRASHED, FlightMetrics
 from dtsa_channel_sim.model.verdict import SUCCESS

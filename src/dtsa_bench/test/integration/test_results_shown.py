@@ -85,7 +85,7 @@ def test_configurations_show_what_differs_from_the_defaults_and_can_be_read_back
 def test_recordings_and_verifications_are_shown_and_escaped_also_where_positions_are_unknown(tmp_path: Path) -> None:
     run = tmp_path / "a & <b>"
     flight_bag(run / "bag", slots=60, loss=0.1, agents=6, policy="lease", seed=3)
-    recording, verification = dtsa.read_bag(run), dtsa.verify(run)
+    recording, verification = dtsa.open(run), dtsa.verify(run)
     assert "60 slots" in repr(recording)
     assert parts_of(recording)[0] == 6
     assert lines_of(recording)

@@ -28,8 +28,8 @@ from dtsa_bench.crazyflies.peer_lab.app import LabSettings
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard
 from dtsa_bench.crazyflies.simulated.process import running_fleet
-from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge
+from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.merge.merge import Merge
 
 KEY = "8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4"
 # Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.

@@ -16,12 +16,12 @@ from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
+from dtsa_bench.log.agent_bag import AgentBag, NothingWritten, read
+from dtsa_bench.log.merge.joined import all_known_after
+from dtsa_bench.log.merge.merge import Merge
+from dtsa_bench.log.merge.timeline import Crossing, Life, both_ways, fit
+from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
-from dtsa_bench.recordings.merge.agent_bag import AgentBag, NothingWritten, read
-from dtsa_bench.recordings.merge.known_pairs import all_known_after
-from dtsa_bench.recordings.merge.merge import Merge
-from dtsa_bench.recordings.merge.timeline import Crossing, Life, both_ways, fit
-from dtsa_bench.recordings.verify import verify_bag
 
 CONFIG = SwarmConfig(agents=3, policy="lease", slot_ms=20.0, open_every=0, adoption=False)
 DELAY_S = 0.1

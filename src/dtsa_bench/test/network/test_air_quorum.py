@@ -11,8 +11,8 @@ from waiting import wait_for
 
 from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import SwarmConfig
-from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge, verified
+from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.merge.merge import Merge, verified
 
 CONFIG = SwarmConfig(agents=4, policy="tdma", slot_ms=20.0)  # a frame counts for 40 slots
 FAST, SLOW = 0.05, 0.001  # m/s

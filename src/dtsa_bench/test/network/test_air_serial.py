@@ -21,10 +21,10 @@ from dtsa_agent.air.serial.frames import to_line
 from dtsa_agent.air.serial.port import SerialPort
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
+from dtsa_bench.log.agent_bag import read
 from dtsa_bench.pages.report.data import run_data
 from dtsa_bench.pages.view.network_listener import NetworkListener
 from dtsa_bench.pages.view.track import Track
-from dtsa_bench.recordings.merge.agent_bag import read
 
 # Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
 CONFIG = SwarmConfig(agents=3, policy="lease", slot_ms=50.0, open_every=0, adoption=False)

@@ -25,16 +25,15 @@ from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.commands.cli import main
+from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.log.merge.merge import Merge, verified
+from dtsa_bench.log.merge.timeline import Crossing, fit
+from dtsa_bench.log.merged_bag import align, write_merged
+from dtsa_bench.log.record import SLOT_RECORD
+from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
-from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.bag.writer import BagWriter
-from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge, verified
-from dtsa_bench.recordings.merge.merged_messages import MergedMessages
-from dtsa_bench.recordings.merge.merged_run import lay
-from dtsa_bench.recordings.merge.merged_writer import write
-from dtsa_bench.recordings.merge.timeline import Crossing, fit
-from dtsa_bench.recordings.verify import verify_bag
 
 KEY = "8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4"
 # Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
@@ -169,29 +168,33 @@ def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespa
     spoken = next(record for record in bags[1].slots[-60:] if record.datagram)
     spoken.datagram = spoken.datagram[:-5] + bytes([spoken.datagram[-5] ^ 1]) + spoken.datagram[-4:]
     assert Merge(bags).judge()["frames_heard_not_as_sent"] > 0
-    topics = ("/swarm/decision", "/cf2/odom")
-    with Bag(flight.whole) as bag:
-        for number, topic in enumerate(topics):
-            with BagWriter(tmp_path / f"{number}", None, custom_data=bag.custom_data) as copy:
-                channels = {name: copy.add_topic(name, info.type, info.profiles) for name, info in bag.topics.items()}
-                for message in bag.messages():
-                    last = message.topic == topic and message.sequence == bag.topics[topic].count - 1
-                    data = (
-                        message.data[:-5] + bytes([message.data[-5] ^ 1]) + message.data[-4:] if last else message.data
-                    )
-                    copy.write(channels[message.topic], data, message.log_time_ns, message.publish_time_ns)
-            difference = verify_bag(tmp_path / f"{number}").difference
-            assert difference is not None
-            assert difference.what == topic
+    for number, name in enumerate(("chosen", "digest", "lost", "received", "data", "odom")):
+        with Bag(flight.whole) as bag, BagWriter(tmp_path / f"{number}", None, custom_data=bag.custom_data) as copy:
+            channels = {name: copy.add_topic(name, info.type, info.profiles) for name, info in bag.topics.items()}
+            late = [m.log_time_ns for m in bag.messages([SLOT_RECORD]) if len(bag.decode(m).sender)][-60]
+            changed = False
+            for message in bag.messages():
+                data = message.data
+                if message.topic == SLOT_RECORD and message.log_time_ns == late and name != "odom":
+                    record = bag.decode(message)
+                    raw = bytearray(getattr(record, name).tobytes())
+                    raw[8 if name == "data" else 0] ^= 1
+                    setattr(record, name, np.frombuffer(bytes(raw), getattr(record, name).dtype))
+                    data, changed = bytes(bag.typestore.serialize_cdr(record, message.type)), True
+                elif message.topic == "/cf2/odom" and name == "odom" and not changed:
+                    data, changed = data[:60] + bytes([data[60] ^ 1]) + data[61:], True
+                copy.write(channels[message.topic], data, message.log_time_ns, message.publish_time_ns)
+        assert changed
+        assert verify_bag(tmp_path / f"{number}").difference is not None, name
     liar = flight.run.lives[(2, 0)].slots[-20]
     said, liar.chosen = liar.chosen, 4 if liar.chosen != 4 else 1
     try:
-        write(tmp_path / "lie", flight.run, {})
+        write_merged(tmp_path / "lie", flight.run, {})
     finally:
         liar.chosen = said
     difference = verify_bag(tmp_path / "lie").difference
     assert difference is not None
-    assert (difference.what, difference.slot, difference.agent) == ("report.chosen", liar.slot, 2)
+    assert (difference.what, difference.slot, difference.agent) == ("chosen", liar.slot, 2)
 
 
 def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Path) -> None:
@@ -211,7 +214,7 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Pa
 
 
 def test_a_merged_flight_is_kept_as_a_bag_in_which_nothing_is_known_of_who_has_none(flight: SimpleNamespace) -> None:
-    found, run = flight.merged["flight"], dtsa.read_bag(flight.whole)
+    found, run = flight.merged["flight"], dtsa.open(flight.whole)
     assert json.loads((flight.whole / "summary.json").read_text())["flight"] == found
     assert "channel_load" not in found  # nobody knows how long this network's frames are on the air
     assert run.summary == found
@@ -224,7 +227,7 @@ def test_a_merged_flight_is_kept_as_a_bag_in_which_nothing_is_known_of_who_has_n
     assert page["distances"]["time"]
     with Reader(flight.whole / "bag") as foreign:  # rosbag2's metadata, and every message, by an independent reader
         assert foreign.message_count == sum(1 for _ in foreign.messages())
-        assert {"/swarm/frame", "/swarm/reception", "/cf1/odom"} <= foreign.topics.keys()
+        assert {SLOT_RECORD, "/swarm/configuration", "/cf1/odom"} <= foreign.topics.keys()
     with Bag(flight.whole) as bag:
         said: dict[str, list[Any]] = {}
         for message, decoded in bag.typed():
@@ -232,9 +235,7 @@ def test_a_merged_flight_is_kept_as_a_bag_in_which_nothing_is_known_of_who_has_n
     pictures = [[(one.action, one.id) for one in picture.markers] for picture in said["/swarm/markers"]]
     assert pictures[0] == [(3, 0)]  # DELETEALL: who vanishes is not left standing
     assert {agent for picture in pictures for action, agent in picture if action == 0} == {1, 2, 3}
-    assert said["/swarm/status"][0].lost.tolist() == [4]
-    assert said["/swarm/status"][-1].reason == "merged from 3 agents' bags"
-    run = dtsa.read_bag(flight.whole)
+    run = dtsa.open(flight.whole)
     assert set(run.states.agent) == set(run.decisions.agent) == {1, 2, 3}
     assert run.receptions.received[run.receptions.receiver == 4].isna().all()
     whole = run.receptions[(run.receptions.receiver < 4) & (run.receptions.slot < run.slots.slot.max() // 2)]
@@ -256,16 +257,15 @@ def test_merge_keeps_the_whole_flight_or_nothing(flight, tmp_path, monkeypatch, 
     cut.write_bytes(flight.bags[0].read_bytes()[: flight.bags[0].stat().st_size * 2 // 3])
     out, words = tmp_path / "out", ["merge", str(cut), *map(str, flight.bags[1:]), "--out", str(tmp_path / "out")]
 
-    def interrupted(self: MergedMessages) -> Any:
-        yield self._configuration()
+    def interrupted(*arguments: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(MergedMessages, "__iter__", interrupted)
+        patch.setattr("dtsa_bench.log.merged_bag._Viewer.show", interrupted)
         assert main(words) == 130
         assert not out.exists()
     assert main([*words, "--json"]) == 0
-    states = dtsa.read_bag(out).states
+    states = dtsa.open(out).states
     ends = states.groupby("agent").time_s.max()
     assert ends[1] < ends[2] - 0.1
     assert verify_bag(out).ok
@@ -275,12 +275,19 @@ def test_merge_keeps_the_whole_flight_or_nothing(flight, tmp_path, monkeypatch, 
     assert capsys.readouterr().err.count("\n") == 1
 
 
-@pytest.mark.parametrize("command", ["verify", "report", "export"])
-def test_commands_for_other_bags_say_what_is_meant_for_these(flight, command, capsys):
-    assert main([command, str(flight.bags[0])]) == 2
-    said = capsys.readouterr().err
-    assert "`tools/dtsa merge`" in said
-    assert len(said.splitlines()) == 1
+@pytest.mark.parametrize("which", ["one agent's", "all in a directory"])
+def test_commands_join_the_bags_of_agents_by_themselves(flight, which, tmp_path, capsys):
+    given = tmp_path / "flown"
+    given.mkdir()
+    for path in flight.bags[: 1 if which == "one agent's" else 3]:
+        (given / path.name).write_bytes(path.read_bytes())
+    for words in (["verify"], ["export", "--out", str(tmp_path / "t")], ["report", "--out", str(tmp_path / "r.html")]):
+        assert main([words[0], str(given), *words[1:]]) == 0, capsys.readouterr().out
+    log = dtsa.open(given)
+    told = [1] if which == "one agent's" else [1, 2, 3]
+    assert sorted(set(log.decisions.agent)) == told
+    if len(told) > 1:
+        assert log.summary == flight.merged["flight"]
 
 
 def test_bags_that_do_not_belong_together_are_refused(flight: SimpleNamespace) -> None:
@@ -293,9 +300,12 @@ def test_bags_that_do_not_belong_together_are_refused(flight: SimpleNamespace) -
         Merge([one, other]).judge()
     with pytest.raises(ConfigError, match="bags"):
         Merge([]).judge()
-    alone = Merge([one])
-    with pytest.raises(ConfigError, match="hear each other"):
-        lay(alone, alone.judge())
+    deaf = read(flight.bags[1])
+    for record in (*one.slots, *deaf.slots):
+        record.before, record.heard = [], []
+    apart = Merge([one, deaf])
+    with pytest.raises(ConfigError, match=r"hear each other|do not go both ways"):
+        align(apart, apart.judge())
 
 
 def test_offsets_and_drifts_are_found_among_frames_that_were_held_up() -> None:

@@ -11,7 +11,7 @@ from node_helpers import end_of, ros_graph
 pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_bench.commands.cli import main
-from dtsa_bench.recordings.merge.agent_bag import read
+from dtsa_bench.log.agent_bag import read
 
 AGENT = "dtsa_agent.ros.agent_node"
 

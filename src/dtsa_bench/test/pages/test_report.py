@@ -18,15 +18,15 @@ from dtsa_agent.core import REASONS
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.commands.cli import main
+from dtsa_bench.log.bag.errors import UnusableBag
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.recover import recover
+from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.log.record import load_log
+from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
 from dtsa_bench.pages.report.distances import pair_distances
 from dtsa_bench.pages.report.page import render, write_report
-from dtsa_bench.recordings.bag.errors import UnusableBag
-from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.bag.recover import recover
-from dtsa_bench.recordings.bag.run import load_run
-from dtsa_bench.recordings.bag.writer import BagWriter
-from dtsa_bench.recordings.verify import verify_bag
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import simulate
 
@@ -50,12 +50,12 @@ def data(flights: dict[str, Path]) -> dict[str, Any]:
 def test_everything_that_reads_a_run_takes_its_directory_its_bag_and_its_file(flights, tmp_path, capsys):
     shutil.copytree(flights["clean"], tmp_path / "a" / "bag")
     file = next((tmp_path / "a" / "bag").glob("*.mcap"))
-    known = load_run(file)
+    known = load_log(file)
     with Bag(file) as bag:
-        assert load_run(bag).slots.tolist() == known.slots.tolist()
+        assert load_log(bag).slots.tolist() == known.slots.tolist()
     for given in (tmp_path / "a", tmp_path / "a" / "bag", file):
         for path in (given, str(given)):
-            assert load_run(path).slots.tolist() == known.slots.tolist()
+            assert load_log(path).slots.tolist() == known.slots.tolist()
             assert run_data(path)["agents"] == 6
             assert verify_bag(path).mode == "lockstep"
         assert recover(given, tmp_path / f"saved-{given.name}").count > 0
@@ -129,7 +129,7 @@ def test_shares_add_up_and_ages_follow_from_who_was_heard(data: dict[str, Any]) 
 
 def test_distances_and_scene_are_those_of_the_positions(flights: dict[str, Path], data: dict[str, Any]) -> None:
     with Bag(flights["lossy"]) as bag:
-        run = load_run(bag)
+        run = load_log(bag)
     found = pair_distances(run)
     assert found is not None
     n = len(run.motion.ids)
@@ -144,7 +144,7 @@ def test_distances_and_scene_are_those_of_the_positions(flights: dict[str, Path]
         assert np.allclose(series, brute[pair])
     scene = data["clean"]["scene"]
     with Bag(flights["clean"]) as bag:
-        run = load_run(bag)
+        run = load_log(bag)
     times = numbers(scene["time"], "<f4")
     places = numbers(scene["position"], "<i2").reshape(len(times), 3, -1) * scene["scale"]
     for frame in (0, len(times) // 2, len(times) - 1):
@@ -167,7 +167,7 @@ def test_crashes_have_their_agents_time_and_place(crash: tuple[dict[str, Any], P
     found = data["crashes"]
     assert found[0]["ids"] == data["summary"]["collided_pair"]
     assert [one["time_s"] for one in found] == sorted(one["time_s"] for one in found)
-    motion = load_run(directory).motion
+    motion = load_log(directory).motion
     for one in found:
         a, b = (motion.position[:, :, number - 1] for number in one["ids"])
         near = np.flatnonzero(np.linalg.norm(a - b, axis=1) < 0.2)
@@ -206,7 +206,7 @@ def test_data_in_the_page_is_the_data(data: dict[str, Any]) -> None:
 
 
 def test_a_bag_without_a_usable_configuration_still_gives_a_page(tmp_path: Path, flights: dict[str, Path]) -> None:
-    from dtsa_bench.recordings.bag.schema import Definition
+    from dtsa_bench.log.bag.schema import Definition
 
     with (
         Bag(flights["clean"]) as bag,

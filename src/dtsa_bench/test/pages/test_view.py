@@ -20,12 +20,12 @@ from browser_helpers import serving
 
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.log.knowledge import observed
+from dtsa_bench.log.record import load_log
 from dtsa_bench.pages.view.moments import MOST_FRAMES, UNKNOWN, Moment, Moments
 from dtsa_bench.pages.view.orders import Order, read_order
 from dtsa_bench.pages.view.server import ViewServer, _Reader
 from dtsa_bench.pages.view.track import MOST_BYTES, MOST_MOMENTS, Track
-from dtsa_bench.recordings.bag.run import load_run
-from dtsa_bench.recordings.tables.ages import follow_run, observed
 from dtsa_channel_sim.model.verdict import SUCCESS
 
 
@@ -40,7 +40,7 @@ def track(bag: Path) -> Track:
 
 
 def test_moments_tell_what_the_bag_holds(bag: Path, track: Track) -> None:
-    run = load_run(bag)
+    run = load_log(bag)
     _, moments = track.since(0, MOST_MOMENTS)
     told = [json.loads(moment.text) for moment in moments]
     assert track.state == "recorded"
@@ -62,8 +62,8 @@ def test_moments_tell_what_the_bag_holds(bag: Path, track: Track) -> None:
 
 
 def test_ages_and_beliefs_are_those_of_the_report(bag: Path, track: Track) -> None:
-    run = load_run(bag)
-    ages = follow_run(run).ages
+    run = load_log(bag)
+    ages = run.knowledge.ages
     assert ages is not None
     by_slot = {one.slot: one for one in observed(run)}
     _, moments = track.since(0, MOST_MOMENTS)

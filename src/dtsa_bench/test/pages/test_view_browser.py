@@ -19,11 +19,11 @@ from browser_helpers import CHROMIUM, MISSING, browsing, colours, serving
 from view_helpers import AGENTS, PATIENCE_S, lossy_bag, numbers, on_graph, track_of, viewed_flight
 from waiting import wait_for
 
+from dtsa_bench.log.record import load_log
 from dtsa_bench.pages.view.moments import Moment
 from dtsa_bench.pages.view.orders import Order
 from dtsa_bench.pages.view.server import ViewServer
 from dtsa_bench.pages.view.track import MOST_MOMENTS, Track, Vehicles
-from dtsa_bench.recordings.bag.run import load_run
 
 FIGURES = """(() => ({
   heads: [...document.querySelectorAll("h2")].map(node => node.textContent),
@@ -140,7 +140,7 @@ def test_a_lockstep_flight_shows_its_page_what_is_in_its_bag(tmp_path: Path) -> 
     with viewed_flight(tmp_path / "run", *words) as (process, url):
         received = asyncio.run(moments(url))
         process.wait(PATIENCE_S)
-    run = load_run(tmp_path / "run")
+    run = load_log(tmp_path / "run")
     recorded = list(zip(run.frames.slot.tolist(), run.frames.sender.tolist(), strict=True))
     columns = [
         np.concatenate([numbers(one["frames"][name], kind) for one in received]).tolist()

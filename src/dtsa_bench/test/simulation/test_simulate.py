@@ -11,9 +11,10 @@ import pytest
 
 from dtsa_agent.core import REASONS
 from dtsa_bench.experiments.sweep import run_config
-from dtsa_bench.recordings.verify import verify_bag
+from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.runs.config import RunConfig
-from dtsa_bench.simulation.simulate import Flight, may_share, simulate
+from dtsa_bench.runs.metrics import may_share
+from dtsa_bench.simulation.simulate import Flight, simulate
 
 
 def run(**settings: Any) -> RunConfig:

@@ -29,7 +29,7 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.crazyflie.node.outputs import EVENTS, EVENTS_QOS
 from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
 from dtsa_agent.ros.common.process.priority import give_way_by
-from dtsa_bench.recordings.bag.writer import BagWriter
+from dtsa_bench.log.bag.writer import BagWriter
 
 MISSION_BAG = "mission_bag"  # the whole mission's bag, beside that of the exchange
 MOST_EVENTS = 5000

@@ -78,7 +78,7 @@ def _fly(
         lab = Laboratory(app, settings, out)
         finish = lab.summary
     else:
-        from .onboard import OnBoard  # recordings: others do without
+        from .onboard import OnBoard  # the log: others do without
 
         flight = OnBoard(swarm, settings, out, key_of(swarm), flags=flags)
         lab, finish = flight.lab, flight.finish

@@ -22,8 +22,8 @@ from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.flight import Flight, fly
 from dtsa_bench.flights.options import FlightOptions
 from dtsa_bench.flights.progress import ProgressLine
-from dtsa_bench.recordings.bag.run import RecordedRun, load_run
-from dtsa_bench.recordings.tables.ages import follow_run
+from dtsa_bench.log.flight_log import FlightLog
+from dtsa_bench.log.merged_bag import open_log
 from dtsa_bench.runs.config import REALTIME, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
@@ -224,20 +224,16 @@ def _fly_live(flight: DemoFlight, out: Path, stop: Stop) -> FinishedFlight:
 
 def read_flight(flight: DemoFlight, result: Flight) -> FinishedFlight:
     """What is shown of a flight, from its bag."""
-    run = load_run(result.bag)
+    log = open_log(result.bag)
     error = np.zeros(0)
-    ages = None if flight.live else follow_run(run).ages
+    ages = None if flight.live else log.knowledge.ages
     if ages is not None:
         known = np.isfinite(ages.error)
         total = np.where(known, ages.error, 0.0).sum(axis=1)
         error = np.where(known.any(axis=1), total / np.maximum(1, known.sum(axis=1)), np.nan)
-    return FinishedFlight(flight, result.summary, result.scenario, senders_of(run), result.positions, error)
+    return FinishedFlight(flight, result.summary, result.scenario, senders_of(log), result.positions, error)
 
 
-def senders_of(run: RecordedRun) -> tuple[tuple[int, ...], ...]:
-    """Ids of the agents that sent in each slot, from slot 0 to the last that the channel judged."""
-    senders: list[list[int]] = [[] for _ in range(int(run.slots[-1]) + 1 if len(run.slots) else 0)]
-    for slot, sender in zip(run.frames.slot.tolist(), run.frames.sender.tolist(), strict=True):
-        if 0 <= slot < len(senders):
-            senders[slot].append(sender)
-    return tuple(tuple(ids) for ids in senders)
+def senders_of(log: FlightLog) -> tuple[tuple[int, ...], ...]:
+    """Ids of the agents that sent in each slot."""
+    return tuple(tuple((np.flatnonzero(row) + 1).tolist()) for row in log.sent)

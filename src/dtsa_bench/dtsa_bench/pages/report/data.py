@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Scenario
+from dtsa_agent.core import REASONS, Scenario
+from dtsa_bench.log.flight_log import FlightLog
+from dtsa_bench.log.knowledge import Ages
+from dtsa_bench.log.merged_bag import open_log
 from dtsa_bench.pages.html import BINS, flatten, pack, reduce_bins, thin
-from dtsa_bench.recordings.bag.metadata import RECOVERED_FROM
-from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.bag.run import OUTCOMES, RecordedRun, load_run
-from dtsa_bench.recordings.tables.ages import follow_run
-from dtsa_bench.recordings.tables.followed import Ages
 from dtsa_bench.runs.hearing import recorded_problem, sentence
+from dtsa_channel_sim.model.verdict import OUTCOMES
 
 from .distances import collision_m, crashes_of, distance_charts, pair_distances
 
@@ -34,19 +33,15 @@ def run_data(path: str | Path) -> dict[str, Any]:
 
     :raises UnusableBag: if it is none of a swarm's run.
     """
-    with Bag(path) as bag:
-        run = load_run(bag)
-        version = bag.custom_data.get("version", "")
-        recovered, file = RECOVERED_FROM in bag.custom_data, bag.path
-    notes = ["This bag was recovered: its recorder was killed or its file was damaged."] if recovered else []
+    run = open_log(path)
     distances = pair_distances(run, collision_m(run))
-    followed = follow_run(run)
-    scenario, ages = followed.scenario, followed.ages
-    notes += followed.notes
-    told = sentence(recorded_problem(file))
+    followed, scenario = run.knowledge, run.scenario
+    ages = followed.ages
+    notes = [*run.notes, *followed.notes]
+    told = sentence(recorded_problem(run.file or path))
     if told and not any(note.startswith(told.partition(":")[0]) for note in notes):
         notes.append(told)
-    if unknown := int((~run.outcome_known).sum()):
+    if unknown := int((run.recorded & ~run.outcome_known).sum()):
         notes.append(f"Of {unknown} slots it is not known whether somebody sent: not all agents have told of them.")
     summary = followed.summary | _counts(run)
     if distances is not None and summary.get("min_distance_m") is None and len(distances.least):
@@ -54,9 +49,9 @@ def run_data(path: str | Path) -> dict[str, Any]:
     return {
         "name": run.name,
         "mission": mission_data(path),
-        "version": version,
+        "version": run.version,
         "notes": notes,
-        "config": flatten(run.config),
+        "config": flatten(run.settings),
         "agents": run.agents,
         "crashes": crashes_of(distances, run, summary),
         "moving": scenario.moving.tolist() if scenario else [True] * run.agents,
@@ -74,114 +69,107 @@ def run_data(path: str | Path) -> dict[str, Any]:
     }
 
 
-def _duration_s(run: RecordedRun) -> float:
-    ends = [0.0]
-    if len(run.slots):
-        ends.append((int(run.slots[-1]) + 1) * run.slot_ns / 1e9)
-    if len(run.motion.time_ns):
-        ends.append((int(run.motion.time_ns[-1]) - run.start_ns) / 1e9)
-    return max(ends)
+def _duration_s(run: FlightLog) -> float:
+    return len(run) * run.slot_ns / 1e9
 
 
-def _counts(run: RecordedRun) -> dict[str, Any]:
+def _counts(run: FlightLog) -> dict[str, Any]:
     counts = np.bincount(run.outcome[run.outcome_known], minlength=len(OUTCOMES))
-    unknown = int((~run.outcome_known).sum())
-    frames = run.frames
+    unknown = int((run.recorded & ~run.outcome_known).sum())
+    frames = run.sent_frames
     offered = int(run.known_receivers.sum())
     return {
         "slots": {
-            "total": len(run.slots),
+            "total": int(run.recorded.sum()),
             **dict(zip(OUTCOMES, counts.tolist(), strict=True)),
             **({"unknown": unknown} if unknown else {}),
         },
-        "frames": len(frames.slot),
+        "frames": len(frames.row),
         "lost_fraction": float(frames.lost.sum()) / offered if offered else 0.0,
     }
 
 
-def _scene(run: RecordedRun, scenario: Scenario | None) -> dict[str, Any] | None:
-    motion = run.motion
-    if not len(motion.ids) or not len(motion.time_ns):
+def _scene(run: FlightLog, scenario: Scenario | None) -> dict[str, Any] | None:
+    time_s, path = run.instants_s, run.path
+    if not len(time_s):
         return None
-    duration = (int(motion.time_ns[-1]) - int(motion.time_ns[0])) / 1e9
-    frames = int(min(duration * SCENE_HZ, SCENE_VALUES / (3 * len(motion.ids)))) + 2
-    index = np.unique(np.linspace(0, len(motion.time_ns) - 1, min(frames, len(motion.time_ns))).astype(int))
-    known = np.isfinite(motion.position[index]) | (run.told is None)
-    place = np.nan_to_num(motion.position[index])
+    frames = int(min(float(time_s[-1] - time_s[0]) * SCENE_HZ, SCENE_VALUES / (3 * run.agents))) + 2
+    index = np.unique(np.linspace(0, len(time_s) - 1, min(frames, len(time_s))).astype(int))
+    known = np.isfinite(path[index])
+    place = np.nan_to_num(path[index])
     span = max(1.0, float(np.abs(place).max()))
     scale = span / 32000
     targets = scenario.target if scenario else place[-1]
     place = np.where(known, place, scale * UNKNOWN)
     return {
-        "ids": motion.ids.tolist(),
-        "time": pack(((motion.time_ns[index] - run.start_ns) / 1e9).astype("<f4")),
+        "ids": list(range(1, run.agents + 1)),
+        "time": pack(time_s[index].astype("<f4")),
         "position": pack(np.round(place / scale).astype("<i2")),
         "scale": scale,
         "target": np.round(targets, 3).T.tolist(),
     }
 
 
-def _slots(run: RecordedRun) -> dict[str, Any]:
+def _slots(run: FlightLog) -> dict[str, Any]:
     """Every frame that was sent: in which slot, by whom, why, and what became of it."""
-    frames = run.frames
-    outcome = np.zeros(len(frames.slot), np.uint8)
-    if len(run.slots):
-        place = np.minimum(np.searchsorted(run.slots, frames.slot), len(run.slots) - 1)
-        outcome = run.outcome[place].astype(np.uint8)
+    frames, unknown = run.sent_frames, np.flatnonzero(run.recorded & ~run.outcome_known)
     share = frames.received.sum(axis=1) / np.maximum(1, run.known_receivers)
     return {
-        "slot": pack(frames.slot.astype("<u4")),
+        "slot": pack(frames.row.astype("<u4")),
         "sender": pack(frames.sender.astype("<u2")),
-        "outcome": pack(outcome),
+        "outcome": pack(np.minimum(run.outcome[frames.row], len(OUTCOMES) - 1)),
         "reason": pack(_sender_reason(run).astype(np.uint8)),
         "received": pack(np.round(255 * np.minimum(share, 1)).astype(np.uint8)),
-        **({} if run.outcome_known.all() else {"unknown": run.slots[~run.outcome_known].tolist()}),
-        "first": int(run.slots[0]) if len(run.slots) else 0,
-        "count": int(run.slots[-1] - run.slots[0]) + 1 if len(run.slots) else 0,
+        **({"unknown": unknown.tolist()} if len(unknown) else {}),
+        "first": 0,
+        "count": len(run),
     }
 
 
-def _sender_reason(run: RecordedRun) -> NDArray[np.int64]:
-    """Why each frame was sent, as its sender decided; 255 where that was not recorded."""
-    decisions, frames = run.decisions, run.frames
-    reason = np.full(len(frames.slot), 255, np.int64)
-    if not len(decisions.slot) or not len(frames.slot):
-        return reason
-    row = np.minimum(np.searchsorted(decisions.slot, frames.slot), len(decisions.slot) - 1)
-    same = decisions.slot[row] == frames.slot
-    mine = decisions.agent[row] == frames.sender[:, None]
-    found = same & mine.any(axis=1)
-    reason[found] = decisions.reason[row[found], mine[found].argmax(axis=1)]
-    return reason
+def _sender_reason(run: FlightLog) -> NDArray[np.int64]:
+    """Why each frame was sent, as its sender decided, by `_reason_codes`; 255 where that was not recorded."""
+    frames, codes = run.sent_frames, _reason_codes(run)
+    place = np.searchsorted(codes, run.reason[frames.row, frames.sender - 1])
+    return np.where(run.known[frames.row, frames.sender - 1], place, 255)
 
 
-def _sent_for(run: RecordedRun) -> list[str]:
+def _reason_codes(run: FlightLog) -> NDArray[np.uint8]:
+    """Reasons that decisions had."""
+    return np.unique(run.reason[run.known])
+
+
+def _reason_names(run: FlightLog) -> list[str]:
+    return [REASONS[code] if code < len(REASONS) else str(code) for code in _reason_codes(run).tolist()]
+
+
+def _sent_for(run: FlightLog) -> list[str]:
     """Reasons for which something was sent."""
     codes = np.unique(_sender_reason(run))
-    return [run.decisions.names[code] for code in codes.tolist() if code < len(run.decisions.names)]
+    names = _reason_names(run)
+    return [names[code] for code in codes.tolist() if code < len(names)]
 
 
-def _bin_of(run: RecordedRun, slots: NDArray[np.int64]) -> tuple[NDArray[np.int64], int, Array]:
+def _bin_of(run: FlightLog, slots: NDArray[np.int64]) -> tuple[NDArray[np.int64], int, Array]:
     """Bin of each slot, number of bins, and the time in the middle of each bin, s."""
-    first, last = int(run.slots[0]), int(run.slots[-1])
-    count = max(1, min(BINS, (last - first + 1) // max(10, run.agents)))  # a few slots at least in each
-    middle = (first + (np.arange(count) + 0.5) * (last - first + 1) / count) * run.slot_ns / 1e9
-    return np.clip((slots - first) * count // (last - first + 1), 0, count - 1), count, middle
+    count = max(1, min(BINS, len(run) // max(10, run.agents)))  # a few slots at least in each
+    middle = (np.arange(count) + 0.5) * len(run) / count * run.slot_ns / 1e9
+    return np.clip(slots * count // len(run), 0, count - 1), count, middle
 
 
-def _channel(run: RecordedRun) -> dict[str, Any] | None:
-    if not len(run.slots):
+def _channel(run: FlightLog) -> dict[str, Any] | None:
+    slots = np.flatnonzero(run.recorded)
+    if not len(slots):
         return None
-    bins, count, middle = _bin_of(run, run.slots)
+    bins, count, middle = _bin_of(run, slots)
     shares = np.zeros((len(OUTCOMES), count))
-    np.add.at(shares, (run.outcome, bins), run.outcome_known)
+    np.add.at(shares, (np.minimum(run.outcome[slots], len(OUTCOMES) - 1), bins), run.outcome_known[slots])
     shares /= np.maximum(1, np.bincount(bins, minlength=count))
-    frames = run.frames
+    frames = run.sent_frames
     lost, offered = np.zeros(count), np.zeros(count)
-    if len(frames.slot):
-        place, _, _ = _bin_of(run, frames.slot)
+    if len(frames.row):
+        place, _, _ = _bin_of(run, frames.row)
         np.add.at(lost, place, frames.lost)
-        np.add.at(offered, place, np.maximum(run.told is None, run.known_receivers))
+        np.add.at(offered, place, np.maximum(run.merged is None, run.known_receivers))
     return {
         "time": thin(middle),
         "share": {name: thin(shares[index]) for index, name in enumerate(OUTCOMES)},
@@ -189,25 +177,27 @@ def _channel(run: RecordedRun) -> dict[str, Any] | None:
     }
 
 
-def _reasons(run: RecordedRun) -> dict[str, Any] | None:
-    decisions = run.decisions
-    if not len(decisions.slot) or not len(run.slots):
+def _reasons(run: FlightLog) -> dict[str, Any] | None:
+    slots, column = np.nonzero(run.known)
+    if not len(slots):
         return None
-    bins, count, middle = _bin_of(run, decisions.slot)
-    shares = np.zeros((len(decisions.names), count))
-    np.add.at(shares, (decisions.reason, bins[:, None]), decisions.agent > 0)
-    disagree = np.array([len(np.unique(row[row > 0])) > 1 for row in decisions.chosen])
+    bins, count, middle = _bin_of(run, slots)
+    names = _reason_names(run)
+    shares = np.zeros((len(names), count))
+    np.add.at(shares, (np.searchsorted(_reason_codes(run), run.reason[slots, column]), bins), 1)
+    least = np.where(run.known, run.chosen, np.iinfo(np.uint16).max).min(axis=1)
+    most = np.where(run.known, run.chosen, 0).max(axis=1)
     return {
-        "names": list(decisions.names),
+        "names": names,
         "total": shares.sum(axis=1).astype(int).tolist(),
         "time": thin(middle),
         "share": [thin(row) for row in shares / np.maximum(1, shares.sum(axis=0))],
-        "disagree": int(disagree.sum()),
+        "disagree": int((run.known.any(axis=1) & (least != most)).sum()),
     }
 
 
-def _ages(ages: Ages | None, run: RecordedRun) -> dict[str, Any] | None:
-    if ages is None or not len(ages.slot):
+def _ages(ages: Ages | None, run: FlightLog) -> dict[str, Any] | None:
+    if ages is None or not len(run):
         return None
 
     def chart(values: Array, digits: int) -> dict[str, Any]:
@@ -225,7 +215,7 @@ def _ages(ages: Ages | None, run: RecordedRun) -> dict[str, Any] | None:
             "top": round(top, digits),
         }
 
-    time_s = run.time_s(ages.slot + 1)
+    time_s = run.time_s(run.slot + 1)
     return {
         "time": thin(reduce_bins(time_s, np.mean)),
         "age": chart(ages.age, 2),
@@ -233,9 +223,9 @@ def _ages(ages: Ages | None, run: RecordedRun) -> dict[str, Any] | None:
     }
 
 
-def _table(run: RecordedRun, ages: Ages | None, scenario: Scenario | None) -> list[dict[str, Any]]:
+def _table(run: FlightLog, ages: Ages | None, scenario: Scenario | None) -> list[dict[str, Any]]:
     """One row an agent."""
-    frames, motion = run.frames, run.motion
+    frames, path = run.sent_frames, run.path
     rows = []
     for agent in range(1, run.agents + 1):
         mine = frames.sender == agent
@@ -253,9 +243,8 @@ def _table(run: RecordedRun, ages: Ages | None, scenario: Scenario | None) -> li
                 known = values[column][np.isfinite(values[column])]
                 row[f"{name}_mean"] = round(float(known.mean()), digits) if len(known) else None
                 row[f"{name}_max"] = round(float(known.max()), digits) if len(known) else None
-        place = np.flatnonzero(motion.ids == agent)
-        if len(place) and len(motion.time_ns) > 1:
-            track = motion.position[:, :, place[0]]
+        if len(path) > 1:
+            track = path[:, :, agent - 1]
             known = np.isfinite(track).all(axis=1)
             steps = np.diff(track[known], axis=0)
             if known.any():
@@ -264,12 +253,12 @@ def _table(run: RecordedRun, ages: Ages | None, scenario: Scenario | None) -> li
     return rows
 
 
-def _heard_share(run: RecordedRun, mine: NDArray[np.bool_]) -> float | None:
+def _heard_share(run: FlightLog, mine: NDArray[np.bool_]) -> float | None:
     """Share of an agent's receivers that received its frames; None without any of which it is known."""
     offered = int(run.known_receivers[mine].sum())
-    if not mine.any() or (run.told is not None and not offered):
+    if not mine.any() or (run.merged is not None and not offered):
         return None
-    return round(float(run.frames.received[mine].sum()) / max(1, offered), 4)
+    return round(float(run.sent_frames.received[mine].sum()) / max(1, offered), 4)
 
 
 def mission_data(path: str | Path) -> dict[str, Any] | None:

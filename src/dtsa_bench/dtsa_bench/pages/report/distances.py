@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_bench.log.arrays import swarm_section
+from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.pages.html import reduce_bins, thin
-from dtsa_bench.recordings.bag.run import RecordedRun, swarm_section
 
 CRASHES = 50  # most that are shown
 PAIRS = 5  # closest pairs whose distance is drawn
@@ -31,18 +32,17 @@ class Distances:
     crashes: list[tuple[int, int, int]]  # ids, and the first moment at which they were too close: index of time_s
 
 
-def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | None:
+def pair_distances(run: FlightLog, collision_m: float = 0.2) -> Distances | None:
     """Distances at the recorded moments, and pairs below `collision_m`; None with fewer than two agents."""
-    motion = run.motion
-    count = len(motion.ids)
-    if count < 2 or not len(motion.time_ns):
+    count, time_s, path = run.agents, run.instants_s, run.path
+    if count < 2 or not len(time_s):
         return None
     first, second = np.triu_indices(count, 1)
-    least = np.empty(len(motion.time_ns))
+    least = np.empty(len(time_s))
     closest = np.full(len(first), np.inf)
     touched = np.full(len(first), -1)
     for start in range(0, len(least), BLOCK):
-        place = motion.position[start : start + BLOCK]
+        place = path[start : start + BLOCK]
         apart = np.sqrt(((place[:, :, first] - place[:, :, second]) ** 2).sum(axis=1))
         apart[np.isnan(apart)] = np.inf
         least[start : start + BLOCK] = apart.min(axis=1)
@@ -50,39 +50,39 @@ def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | No
         near = apart < collision_m
         new = near.any(axis=0) & (touched < 0)
         touched[new] = start + near[:, new].argmax(axis=0)
+    if not np.isfinite(closest).any():
+        return None  # no two agents of whom it is known where they were
     chosen = [k for k in np.argsort(closest, kind="stable")[:PAIRS] if math.isfinite(closest[k])]
     series = []
     for k in chosen:
-        gap = motion.position[:, :, first[k]] - motion.position[:, :, second[k]]
+        gap = path[:, :, first[k]] - path[:, :, second[k]]
         series.append(np.sqrt((gap**2).sum(axis=1)))
-    pairs = [(int(motion.ids[first[k]]), int(motion.ids[second[k]])) for k in chosen]
-    ids = motion.ids
-    crashes = [(int(ids[first[k]]), int(ids[second[k]]), int(touched[k])) for k in np.flatnonzero(touched >= 0)]
+    pairs = [(int(first[k]) + 1, int(second[k]) + 1) for k in chosen]
+    crashes = [(int(first[k]) + 1, int(second[k]) + 1, int(touched[k])) for k in np.flatnonzero(touched >= 0)]
     crashes.sort(key=lambda crash: crash[2])
-    return Distances((motion.time_ns - run.start_ns) / 1e9, least, pairs, series, crashes)
+    return Distances(time_s, least, pairs, series, crashes)
 
 
-def collision_m(run: RecordedRun) -> float:
+def collision_m(run: FlightLog) -> float:
     """Below this distance two agents have crashed, m."""
-    limits = run.config.get("limits", {})
+    limits = run.settings.get("limits", {})
     return float(limits.get("collision_m", 0.2)) if isinstance(limits, Mapping) else 0.2
 
 
-def crashes_of(distances: Distances | None, run: RecordedRun, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+def crashes_of(distances: Distances | None, run: FlightLog, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Which agents crashed, when and where; the first ones if there are many."""
     if distances is None:
         return []
     found = list(distances.crashes)
     pair = tuple(summary.get("collided_pair") or ())
-    motion = run.motion
-    places = {int(number): place for place, number in enumerate(motion.ids)}
-    if not found and len(pair) == 2 and set(pair) <= places.keys():
+    path = run.path
+    if not found and len(pair) == 2:
         # They crashed within a slot, and only its ends were recorded.
-        gap = motion.position[:, :, places[pair[0]]] - motion.position[:, :, places[pair[1]]]
+        gap = path[:, :, pair[0] - 1] - path[:, :, pair[1] - 1]
         found = [(*pair, int(np.nanargmin((gap**2).sum(axis=1))))]
     crashes = []
     for one, other, moment in found[:CRASHES]:
-        a, b = (motion.position[moment, :, places[number]] for number in (one, other))
+        a, b = (path[moment, :, number - 1] for number in (one, other))
         crashes.append(
             {
                 "ids": [one, other],
@@ -94,7 +94,7 @@ def crashes_of(distances: Distances | None, run: RecordedRun, summary: Mapping[s
     return crashes
 
 
-def distance_charts(distances: Distances | None, run: RecordedRun) -> dict[str, Any] | None:
+def distance_charts(distances: Distances | None, run: FlightLog) -> dict[str, Any] | None:
     """Distances over time as a page shows them, and what they are compared with."""
     if distances is None:
         return None
@@ -111,5 +111,5 @@ def distance_charts(distances: Distances | None, run: RecordedRun) -> dict[str, 
             for pair, series in zip(distances.pairs, distances.series, strict=True)
         ],
         "collision": collision_m(run),
-        "r_min": float(swarm_section(run.config).get("r_min", 0.3) or 0.3),
+        "r_min": float(swarm_section(run.settings).get("r_min", 0.3) or 0.3),
     }

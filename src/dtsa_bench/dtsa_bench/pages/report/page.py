@@ -8,8 +8,8 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASON_TEXTS
+from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.pages.html import PALETTE, SCRIPTS, render_page, write_page
-from dtsa_bench.recordings.bag.errors import BagError
 
 from .data import run_data
 

@@ -28,9 +28,9 @@ from dtsa_agent.core.station import (
     check_joinable,
 )
 from dtsa_agent.keys import authenticator
+from dtsa_bench.log.merge.joined import all_known_after
+from dtsa_bench.log.rules import Judge
 from dtsa_bench.pages.html import pack
-from dtsa_bench.recordings.merge.known_pairs import all_known_after
-from dtsa_bench.recordings.rules.judge import Judge
 from dtsa_bench.runs.config import REALTIME, RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS
 

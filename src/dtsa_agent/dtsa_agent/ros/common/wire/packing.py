@@ -21,6 +21,7 @@ RUN_MESSAGES = frozenset(
         "Decision",
         "Configuration",
         "RunStatus",
+        "SlotRecord",
     )
 )
 

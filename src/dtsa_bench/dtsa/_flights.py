@@ -1,0 +1,71 @@
+"""Flights: simulated, recorded, verified."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.experiments.sweep import run_config as _run_config
+from dtsa_bench.log.arrays import LogBuilder
+from dtsa_bench.log.flight_log import FlightLog
+from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.simulation.simulate import simulate as _simulate
+
+if TYPE_CHECKING:
+    from dtsa_bench.log.verify.result import Result
+
+
+def run_config(**settings: Any) -> RunConfig:
+    """The configuration of a run from settings by name.
+
+    :param settings: settings of the swarm, of the channel and of the end of a run side by side, such as
+        `agents=12, loss=0.1, timeout_s=20`, with the units and ranges of :class:`SwarmConfig`, :class:`ChannelConfig`
+        and :class:`RunLimits`. `seed` is that of the swarm and of the channel.
+    :raises ConfigError: for a name that does not exist or a value that is not allowed.
+    """
+    return _run_config(settings)
+
+
+def simulate(config: RunConfig | None = None, *, trace: bool = True, **settings: Any) -> FlightLog:
+    """Fly one run without ROS; equal configurations give equal flights, bit for bit.
+
+    :param config: the run; None: made from the settings.
+    :param trace: keep what happened in every slot, which arrays, tables and figures need: about 150 bytes an agent and
+        slot.
+    :param settings: as for :func:`run_config`, if there is no config.
+    :raises ConfigError: for a setting that is not usable, or both a config and settings.
+    """
+    if config is not None and settings:
+        raise ConfigError("settings", sorted(settings), "none beside a config")
+    run = run_config(**settings) if config is None else config
+    flight = _simulate(run, log=trace)
+    if flight.log is not None:
+        return flight.log
+    return FlightLog(**LogBuilder(run).fields(flight.swarm.track), results=flight.summary(), is_kept=False)
+
+
+def open(path: str | Path) -> FlightLog:
+    """Read a recorded flight, without ROS; of a directory with the bags of its agents, these as one.
+
+    :param path: run directory, bag directory or .mcap file.
+    :raises UnusableBag: if it is no bag of this project, or is damaged.
+    :raises ConfigError: for bags of agents that are not of one flight.
+    """
+    from dtsa_bench.log.merged_bag import open_log
+
+    return open_log(path)
+
+
+def verify(path: str | Path, *, progress: Callable[[int], None] | None = None) -> Result:
+    """Check whether every message of a recorded run is what the protocol gives.
+
+    :param path: run directory, bag directory or .mcap file.
+    :param progress: is called with the slot now and then.
+    :returns: what was checked, and the first difference if there is one.
+    :raises UnusableBag: if it cannot be read as a bag of this project at all.
+    """
+    from dtsa_bench.log.verify.check import verify_bag
+
+    return verify_bag(path, progress)

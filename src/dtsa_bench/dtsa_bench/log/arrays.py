@@ -1,0 +1,370 @@
+"""What happened in a flight as arrays: one row a slot, a column an agent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import Scenario, Swarm
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.frame import EXTENT_M, named_in
+from dtsa_agent.core.settings.scenario import make_scenario
+from dtsa_bench.runs.config import RunConfig
+from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
+
+UNKNOWN = len(OUTCOMES)  # outcome of a slot of which not all that could have sent have told
+PRESENT, LEAVING, NEW = 1, 2, 128  # presence of an agent; NEW is added
+MAX_GAPS_LISTED = 5
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class SentFrames(NamedTuple):
+    """All frames that were sent, in order of slot and sender; arrays have one row a frame (F)."""
+
+    row: NDArray[np.int64]  # of the log
+    sender: NDArray[np.int64]  # ids
+    data: list[bytes]
+    received: Mask  # (F, N) by id - 1
+    lost: NDArray[np.int64]  # receivers that lost it to noise
+    collided: NDArray[np.int64]  # receivers at which it collided
+
+
+class HeardFrames(NamedTuple):
+    """Frames that agents with clocks of their own took in, in this order; arrays have one row an entry (H)."""
+
+    row: NDArray[np.int64]  # in whose slot they were taken in
+    sender: NDArray[np.int64]  # ids
+    slot: NDArray[np.int64]  # that the sender counted
+    time_ns: NDArray[np.int64]  # ns, when, from the start of slot 0
+    by: Mask  # (H, N) by whom
+    before: Mask  # (H,) before the slot, by an agent that began with it
+    data: list[bytes]
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class FlightArrays:
+    """What happened in a flight: S slots, N agents by id - 1, K control instants a slot.
+
+    Arrays are in frame `map` (the room's centre, ENU) and SI units. What is not known is 0 or not a number, and False
+    in `known`.
+    """
+
+    name: str
+    settings: dict[str, Any]  # the configuration as plain values
+    agents: int
+    slot_ns: int  # ns, length of a slot
+    recorded: Mask  # (S,) slots of which there is a record
+    known: Mask  # (S, N) agents that have told of a slot
+    start_ns: NDArray[np.int64]  # (S,) ns, when each slot starts, by the clock of the log; of most, from slot 0 on
+    outcome: NDArray[np.uint8]  # (S,) index into OUTCOMES, or UNKNOWN
+    length: NDArray[np.uint8]  # (S, N) bytes of the frame sent; 0: none
+    data: bytes  # all frames, in order of slot and sender
+    received: Mask  # (F, N) frame f, in that order, reached agent column + 1
+    lost: NDArray[np.uint16]  # (S, N) receivers that lost the sender's frame to noise
+    collided: NDArray[np.uint16]  # (S, N) receivers at which it collided
+    chosen: NDArray[np.uint16]  # (S, N) id of whom each agent took for the sender; 0: nobody
+    reason: NDArray[np.uint8]  # (S, N) why, index into REASONS
+    digest: NDArray[np.uint32]  # (S, N) of each agent's table
+    score: Floats  # (S, N) priority value g of the chosen
+    offset_ns: NDArray[np.int64]  # (S, N) ns, start of an agent's slot, or of its transmission, from the slot's start
+    track: Floats  # (S + 1, K, 3, N) m, control instants of the slot before each slot, and of the last one
+    velocity: Floats  # (S, 3, N) m/s, at the slot's start
+    command: Floats  # (S, 3, N) m/s, commanded, at the slot's start
+    goal: Floats  # (S, 3, N) m
+    sent_ns: NDArray[np.int64] | None = (
+        None  # (S, N) ns, with clocks of their own: start of each transmission, likewise
+    )
+    presence: NDArray[np.uint8] | None = None  # (S, N) PRESENT, LEAVING, and NEW added; None: all present
+    heard: HeardFrames | None = None  # in flights of agents with clocks of their own
+    first_slot: int = 0  # number that the agents gave slot 0
+    merged: dict[str, Any] | None = None  # what the log was merged from; None: it was recorded as one
+    earlier: FlightArrays | None = None  # of a merged one: slots before the first that all counted alike
+    results: dict[str, Any] | None = None  # the results where they are known already
+    notes: list[str] = field(default_factory=list)  # what readers should know of the record
+    file: Path | None = None  # where it is recorded
+    version: str = ""  # of this project, which recorded it
+    is_kept: bool = True  # whether slots were kept at all
+    has_end: bool = True  # whether it is known where all were at the end of the last slot
+
+    # -- what it is ---------------------------------------------------------------------------------------------------
+    def __len__(self) -> int:
+        return len(self.outcome)
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """The configuration.
+
+        :raises ConfigError: if it cannot be used, for example because a plug-in is not installed.
+        """
+        return recorded_config(self.settings)
+
+    @property
+    def usable_config(self) -> RunConfig | None:
+        """The configuration; None if it cannot be used."""
+        try:
+            return self.config
+        except (DtsaError, TypeError, ValueError):
+            return None
+
+    @cached_property
+    def scenario(self) -> Scenario | None:
+        """Starts and goals; None if the configuration cannot be used."""
+        config = self.usable_config
+        try:
+            return None if config is None else make_scenario(config.swarm)
+        except DtsaError:
+            return None
+
+    @property
+    def moving(self) -> Mask:
+        """(N,) which agents move; all, where the configuration cannot be used."""
+        return np.ones(self.agents, np.bool_) if self.scenario is None else self.scenario.moving
+
+    @property
+    def sent(self) -> Mask:
+        """(S, N) who sent."""
+        return self.length > 0
+
+    @property
+    def slot(self) -> NDArray[np.int64]:
+        """(S,) numbers of the slots."""
+        return np.arange(len(self))
+
+    @property
+    def position(self) -> Floats:
+        """(S, K, 3, N) m: true positions at the control instants of each slot, the last at its end."""
+        return self.track[1:]
+
+    @property
+    def missing(self) -> str:
+        """Slots and agents of which there is no record, in words; empty: none."""
+        absent = np.flatnonzero(~self.known.any(axis=0)) + 1 if len(self) else np.zeros(0, np.int64)
+        if not self.is_kept:
+            return ""
+        parts = (missing_slots(self.recorded), len(absent) and f"the motion of {', '.join(f'cf{k}' for k in absent)}")
+        return " and ".join(str(part) for part in parts if part)
+
+    @property
+    def outcome_known(self) -> Mask:
+        """(S,) whether a slot's outcome is known."""
+        return np.asarray(self.recorded & (self.outcome < UNKNOWN))
+
+    def time_s(self, slot: NDArray[np.int64]) -> Floats:
+        """Seconds from the start of slot 0 to the start of slots."""
+        return np.asarray(slot * (self.slot_ns / 1e9), np.float64)
+
+    # -- frames and motion --------------------------------------------------------------------------------------------
+    @cached_property
+    def sent_frames(self) -> SentFrames:
+        """All frames that were sent."""
+        row, column = np.nonzero(self.length)
+        ends = np.cumsum(self.length[row, column], dtype=np.int64)
+        starts = ends - self.length[row, column]
+        data = [self.data[a:b] for a, b in zip(starts.tolist(), ends.tolist(), strict=True)]
+        lost, collided = (values[row, column].astype(np.int64) for values in (self.lost, self.collided))
+        return SentFrames(row, column + 1, data, self.received, lost, collided)
+
+    @cached_property
+    def _frame_ends(self) -> NDArray[np.int64]:
+        return np.cumsum(self.length, dtype=np.int64)
+
+    def frame(self, row: int, sender: int) -> bytes:
+        """The frame that an agent sent in a slot; empty: none."""
+        place = row * self.agents + sender - 1
+        end = int(self._frame_ends[place])
+        return self.data[end - int(self.length[row, sender - 1]) : end]
+
+    @cached_property
+    def known_receivers(self) -> NDArray[np.int64]:
+        """(F,) other agents of which is known whether they received a frame."""
+        frames = self.sent_frames
+        if self.merged is None:
+            return np.full(len(frames.row), max(0, self.agents - 1), np.int64)
+        return np.asarray(frames.received.sum(axis=1) + frames.lost, np.int64)
+
+    @cached_property
+    def _instants(self) -> tuple[NDArray[np.int64], Floats, Floats]:
+        """Times (T,), positions and velocities (T, 3, N) of the control instants at which an agent was recorded."""
+        self.check_kept()
+        count, steps = self.track.shape[:2]
+        velocity = np.full(self.track.shape, np.nan)
+        if len(self):
+            velocity[:-1, -1] = np.where(self.known[:, None], self.velocity, np.nan)
+            velocity[-1, -1] = velocity[-2, -1] if count > 1 else np.nan
+            part = (np.arange(steps)[:-1] + 1)[:, None, None] / steps
+            before = np.concatenate((velocity[:1, -1], velocity[:-1, -1]))[:, None]
+            velocity[:, :-1] = before + (velocity[:, -1:] - before) * part  # only those at slots' starts are recorded
+        times = (np.arange(count)[:, None] - 1) * self.slot_ns + (np.arange(steps) + 1) * self.slot_ns // steps
+        if self.merged is None:
+            flown = np.isfinite(self.track).all(axis=(2, 3)) & (times >= 0)
+        else:
+            flown = (times >= 0) & (times <= (count - 1 if self.has_end else count - 2) * self.slot_ns)
+        return times[flown], self.track[flown], velocity[flown]
+
+    @property
+    def instants_ns(self) -> NDArray[np.int64]:
+        """(T,) ns from the start of slot 0: the control instants of `path`."""
+        return self._instants[0]
+
+    @property
+    def instants_s(self) -> Floats:
+        """(T,) s from the start of slot 0: the control instants of `path`."""
+        return np.asarray(self._instants[0] / 1e9)
+
+    @property
+    def path(self) -> Floats:
+        """(T, 3, N) m, frame map: true positions from the start of slot 0; not a number where that is not known."""
+        return self._instants[1]
+
+    @property
+    def path_velocity(self) -> Floats:
+        """(T, 3, N) m/s: true velocities at the instants of `path`."""
+        return self._instants[2]
+
+    @property
+    def start(self) -> Floats:
+        """(3, N) m, frame map: where the agents were at the start of slot 0."""
+        return np.asarray(self.track[0, -1])
+
+    def check_kept(self) -> None:
+        if not self.is_kept:
+            raise ConfigError("trace", False, "True in simulate(): this flight did not keep what happened in its slots")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+def missing_slots(recorded: Mask) -> str:
+    """The slots without a record, as "slots 158 to 313"; empty: there are none."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([True], recorded, [True])).astype(np.int8)))
+    gaps = [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
+    words = [f"{first} to {last}" if first < last else f"{first}" for first, last in gaps[:MAX_GAPS_LISTED]]
+    more = f" and {len(gaps) - MAX_GAPS_LISTED} gaps more" if len(gaps) > MAX_GAPS_LISTED else ""
+    return f"slots {', '.join(words)}{more}" if gaps else ""
+
+
+def recorded_config(settings: Mapping[str, Any]) -> RunConfig:
+    """Recorded settings as this version understands them.
+
+    :raises DtsaError, TypeError, ValueError: they are not understood, or name a plug-in that is not installed.
+    """
+    return RunConfig.from_dict(dict(settings) if "swarm" in settings else {"swarm": dict(settings)})
+
+
+def swarm_section(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The swarm's part of recorded settings, whether they have sections or not."""
+    section = settings.get("swarm", settings)
+    return section if isinstance(section, Mapping) else {}
+
+
+def extent_of(settings: Mapping[str, Any]) -> float:
+    """Largest coordinate that the frames of a flight can say, m."""
+    value = swarm_section(settings).get("extent_m", EXTENT_M)
+    return float(value) if isinstance(value, (int, float)) and 0 < value < float("inf") else EXTENT_M
+
+
+# -- making one ------------------------------------------------------------------------------------------------------
+_BLOCK = 256  # slots, of the first block of memory
+
+
+class LogBuilder:
+    """Fills a log slot by slot from agents of the core.
+
+    In each slot: :meth:`open` when all have decided and encoded their frames, :meth:`close` with the verdict.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        self._config, swarm = config, config.swarm
+        n, steps = swarm.agents, swarm.steps
+        self.rows = 0
+        self._shapes: dict[str, tuple[tuple[int, ...], Any]] = {
+            "outcome": ((), np.uint8), "length": ((n,), np.uint8), "lost": ((n,), np.uint16),
+            "collided": ((n,), np.uint16), "chosen": ((n,), np.uint16), "reason": ((n,), np.uint8),
+            "digest": ((n,), np.uint32), "score": ((n,), np.float64), "velocity": ((3, n), np.float64),
+            "command": ((3, n), np.float64), "goal": ((3, n), np.float64), "track": ((steps, 3, n), np.float64),
+        }  # fmt: skip
+        self.arrays = {name: np.zeros((_BLOCK, *shape), kind) for name, (shape, kind) in self._shapes.items()}
+        self.frames: list[dict[int, bytes]] = []  # by sender, a slot
+        self.received: list[Mask] = []  # (F, N), a slot
+        self._heard: list[tuple[int, bytes, Mask]] = []  # as in HeardFrames: row and slot, data, by
+        self._heard_row: list[int] = []
+
+    def open(self, swarm: Swarm, frames: dict[int, bytes]) -> None:
+        """A slot begins: what the agents decided, and where they are.
+
+        :param frames: by the sender's id.
+        """
+        row, arrays = self.rows, self.arrays
+        if row + 1 >= len(arrays["outcome"]):
+            for name, values in arrays.items():
+                arrays[name] = np.concatenate((values, np.zeros_like(values)))
+        for name in ("chosen", "reason", "digest", "score", "velocity", "command", "goal", "track"):
+            arrays[name][row] = getattr(swarm, name)
+        if row == 0:
+            arrays["track"][0] = swarm.position  # the control instants before slot 0 have not been flown
+        for sender, data in frames.items():
+            arrays["length"][row, sender - 1] = len(data)
+        self.frames.append(frames)
+
+    def hear(self, slot: int, data: bytes, by: Mask) -> None:
+        """Agents take a frame in as one of a slot, which may be over."""
+        self._heard.append((slot, data, by.astype(np.bool_)))
+        self._heard_row.append(self.rows)
+
+    def close(self, verdict: Verdict) -> None:
+        """The slot is over."""
+        row, arrays = self.rows, self.arrays
+        arrays["outcome"][row] = verdict.outcome
+        if verdict.senders:
+            columns = [sender - 1 for sender in verdict.senders]
+            order = np.argsort(columns)
+            for name, values in (("lost", verdict.lost), ("collided", verdict.collided)):
+                if values is not None:
+                    arrays[name][row, columns] = values
+            mask = verdict.mask(self._config.swarm.agents)
+            self.received.append(mask if len(columns) == 1 else mask[order])
+        else:
+            self.received.append(np.zeros((0, self._config.swarm.agents), np.bool_))
+        self.rows += 1
+
+    def close_unslotted(
+        self, outcome: int, senders: Sequence[int], heard: Sequence[tuple[int, bytes, NDArray[Any]]]
+    ) -> None:
+        """The slot of a flight without slots is over: who took a frame in that arrived in it, received its sender's."""
+        mask = np.zeros((len(senders), self._config.swarm.agents), np.bool_)
+        for _, data, by in heard:
+            told = named_in(data)
+            if told is not None and told[0] in senders:
+                mask[senders.index(told[0])] |= by.astype(np.bool_)
+        mask[np.arange(len(senders)), np.array(senders, np.intp) - 1] = False
+        self.close(Verdict(outcome, tuple(senders), mask, None, None))
+
+    def fields(self, track: Floats) -> dict[str, Any]:
+        """The fields of the log, with the positions (K, 3, N) of the last slot, m."""
+        rows, swarm = self.rows, self._config.swarm
+        self.arrays["track"][rows] = track
+        kept = {name: np.ascontiguousarray(values[: rows + (name == "track")]) for name, values in self.arrays.items()}
+        shape = rows, swarm.agents
+        data = b"".join(frames[sender] for frames in self.frames for sender in sorted(frames))
+        received = np.concatenate(self.received) if self.received else np.zeros((0, swarm.agents), np.bool_)
+        fields: dict[str, Any] = {
+            "name": "", "settings": self._config.to_dict(), "agents": swarm.agents, "slot_ns": swarm.slot_ns,
+            "recorded": np.ones(rows, np.bool_), "known": np.ones(shape, np.bool_), "data": data,
+            "received": received, "offset_ns": np.zeros(shape, np.int64),
+            "start_ns": np.arange(rows) * swarm.slot_ns, **kept,
+        }  # fmt: skip
+        if self._heard:
+            slots, frames, by = zip(*self._heard, strict=True)
+            rows_of, none = np.array(self._heard_row), np.zeros(len(slots), np.int64)
+            fields["heard"] = HeardFrames(
+                rows_of, none, np.array(slots), none, np.array(by), none.astype(np.bool_), list(frames)
+            )
+        return fields

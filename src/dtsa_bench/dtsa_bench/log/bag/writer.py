@@ -1,0 +1,320 @@
+"""Records a run to a bag directory that rosbag2 (Jazzy), Foxglove, PlotJuggler and plain MCAP readers open.
+
+`<directory>/<name>_0.mcap` holds the messages in compressed chunks with all indexes,
+`<directory>/metadata.yaml` describes it. A chunk is closed and handed to the operating system every half
+second, so that a killed recorder loses no more than that; `dtsa_bench.log.bag.recover` makes a full bag of
+what it left. A recorder that says where a step of its run is complete (`mark`) gets chunks that end there and
+nowhere else: whatever byte such a file is cut at, its whole chunks are a run up to a complete step.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from hashlib import blake2b
+from pathlib import Path
+from time import monotonic
+from types import TracebackType
+from typing import Any, NoReturn
+
+from mcap.writer import CompressionType, Writer
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.ros.common.wire.packing import RUN_MESSAGES, without_run
+from dtsa_bench import __version__
+from dtsa_bench.runs.program import program
+
+from . import metadata, schema
+from .errors import BagError
+from .metadata import Profile
+
+COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
+FLUSH_S = 0.5
+BROKEN_OFF = "broken_off"  # key of custom_data of a bag saved from a file that was not finished: its end, ns
+MARKED = "chunks"  # key of custom_data of a bag whose chunks end where a step of the run is complete,
+COMPLETE = "complete steps"  # and its value
+_UNLIMITED = 1 << 62  # bytes: chunks end at marks
+_RECORD_BYTES = 31  # bytes of a message record beside its data
+
+
+class BagWriter:
+    """One bag directory being recorded. For one thread; a context manager.
+
+    :param directory: where the bag is made; must not exist, or be empty. Parents are made.
+    :param config: configuration of the run, JSON types only: stored whole in the bag, its `seed` once more
+        by itself; None: the bag says nothing of its origin but `custom_data`.
+    :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
+    :param chunk_size: bytes, size at which a chunk is closed even if its half second is not over.
+    :param custom_data: further texts for `custom_data` of the metadata.
+    :param ros_distro: ROS distribution named in the metadata.
+    :param min_time_ns: ns, earliest log time that is accepted.
+    :param marked: whether chunks end at a `mark` only; who records calls it after each step of the run.
+    :raises ConfigError: if the directory is in use or the compression is unknown.
+    :raises BagError: if the directory cannot be made or written to.
+    """
+
+    def __init__(
+        self,
+        directory: str | Path,
+        config: Mapping[str, Any] | None,
+        compression: str = "zstd",
+        chunk_size: int = 1 << 20,
+        custom_data: Mapping[str, str] | None = None,
+        ros_distro: str = "jazzy",
+        min_time_ns: int = MIN_TIME_NS,
+        marked: bool = False,
+    ) -> None:
+        if compression not in COMPRESSIONS:
+            raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
+        self.directory = Path(directory)
+        if self.directory.exists() and (not self.directory.is_dir() or any(self.directory.iterdir())):
+            raise ConfigError("directory of the bag", str(directory), "one that is empty or does not exist yet")
+        self.custom_data = dict(custom_data or {})
+        if config is not None:
+            self.custom_data |= {
+                "project": "dtsa",
+                "version": __version__,
+                "seed": str({**config, **config.get("swarm", {})}.get("seed", "")),
+                "configuration": json.dumps(config, sort_keys=True),
+            }
+        if marked:
+            self.custom_data[MARKED] = COMPLETE
+        self._marked, self._chunk_size = marked, chunk_size
+        self._chunk_bytes = 0  # in the chunk that is being filled
+        self._min_time_ns = min_time_ns
+        self.path = self.directory / f"{self.directory.resolve().name}_0.mcap"
+        self._ros_distro = ros_distro
+        self._topics: dict[str, tuple[int, schema.Definition, list[Profile]]] = {}
+        self._schemas: dict[str, int] = {}
+        self._counts = [0]  # messages by channel id; ids start at 1
+        self._names = [b""]  # topics by channel id
+        self._runs = [False]  # by channel id: whether its messages carry the run's id
+        self._digest = BagDigest()
+        self._start_ns = 1 << 63
+        self._end_ns = 0
+        self._unsaved = 0  # messages since the last flush
+        self._failure = ""
+        self._closed = False
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            self._stream = self.path.open("xb")
+        except OSError as error:
+            raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
+        size = _UNLIMITED if marked else chunk_size
+        self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
+        try:
+            self._mcap.start(profile="ros2", library=f"dtsa {__version__}")
+            self._add_metadata_record()
+            self._stream.flush()
+        except OSError as error:
+            self._fail(error)
+        self._next_flush = monotonic() + FLUSH_S
+
+    @property
+    def message_count(self) -> int:
+        """Messages written so far."""
+        return sum(self._counts)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages written so far, by topic."""
+        return {name: self._counts[entry[0]] for name, entry in self._topics.items()}
+
+    @property
+    def time_range_ns(self) -> tuple[int, int]:
+        """Log times of the earliest and the latest message, ns; zeros in an empty bag."""
+        return (self._start_ns, self._end_ns) if self.message_count else (0, 0)
+
+    def add_topic(
+        self,
+        topic: str,
+        type_name: str,
+        qos: str | Profile | Sequence[Profile] = "reliable",
+        definition: schema.Definition | None = None,
+    ) -> int:
+        """Announce a topic; may be done at any time before its first message.
+
+        :param topic: full name, with its leading slash.
+        :param type_name: "package/msg/Type".
+        :param qos: name from `metadata.PROFILES`, or the profile or profiles that its publishers offer.
+        :param definition: message definition and type hash; None: those of the installed type.
+        :return: the channel for `write`.
+        :raises ConfigError: if the topic is there already or the QoS name is unknown.
+        :raises BagError: if the type is not installed.
+        """
+        self._check_open()
+        if topic in self._topics:
+            raise ConfigError("topic", topic, "a name that is not in the bag yet")
+        profiles = metadata.resolve_profiles(qos)
+        definition = definition or schema.installed(type_name)
+        if type_name not in self._schemas:
+            self._schemas[type_name] = self._mcap.register_schema(type_name, "ros2msg", definition.text.encode())
+        channel = self._mcap.register_channel(
+            topic,
+            "cdr",
+            self._schemas[type_name],
+            {"offered_qos_profiles": metadata.dump_profiles(profiles), "topic_type_hash": definition.type_hash},
+        )
+        self._topics[topic] = (channel, definition, profiles)
+        self._counts.append(0)
+        self._names.append(topic.encode())
+        self._runs.append(type_name in RUN_MESSAGES)
+        return channel
+
+    def write(
+        self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int | None = None
+    ) -> None:
+        """Record one message.
+
+        :param channel: number of the channel, as `add_topic` gave it.
+        :param data: the message as CDR, with its encapsulation header.
+        :param log_time_ns: ns, simulated time of reception, 1 s or later.
+        :param publish_time_ns: ns, simulated time of transmission.
+        :param sequence: number of the message on its topic; None: the next one.
+        :raises BagError: if the message cannot be kept: full disk, closed bag.
+        """
+        if self._closed or self._failure:
+            self._check_open()
+        if log_time_ns < self._min_time_ns:
+            raise BagError(f"message at {log_time_ns} ns: times of a bag start at {self._min_time_ns} ns")
+        if not 0 < channel < len(self._counts):
+            raise BagError(f"channel {channel} was never added to {self.directory}")
+        self._unsaved += 1
+        if sequence is None:
+            sequence = self._counts[channel]
+        try:
+            self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
+        except OSError as error:
+            self._fail(error)
+        self._digest.add(self._names[channel], log_time_ns, publish_time_ns, sequence, data, self._runs[channel])
+        self._counts[channel] += 1
+        if log_time_ns < self._start_ns:
+            self._start_ns = log_time_ns
+        if log_time_ns > self._end_ns:
+            self._end_ns = log_time_ns
+        if self._marked:
+            self._chunk_bytes += len(data) + _RECORD_BYTES
+        elif monotonic() >= self._next_flush:
+            self.flush()
+
+    def mark(self) -> None:
+        """What has been written until now is a run up to a complete step: a chunk may end here.
+
+        :raises BagError: if what is due cannot be saved.
+        """
+        if self._marked and (monotonic() >= self._next_flush or self._chunk_bytes > self._chunk_size):
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system.
+
+        `write`, or `mark` where there are marks, does this by itself every half second of wall time; a recorder that
+        may wait long for its next message calls it too.
+
+        :raises BagError: if that fails, on a full disk for example.
+        """
+        self._check_open()
+        try:
+            self._mcap.flush()
+        except OSError as error:
+            self._fail(error)
+        self._unsaved = self._chunk_bytes = 0
+        self._next_flush = monotonic() + FLUSH_S
+
+    def close(self) -> None:
+        """Finish the file and write `metadata.yaml`. Further calls do nothing.
+
+        :raises BagError: if the bag could not be finished; `recover` then makes a full bag of it.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        if self._failure:  # told already, by the call that met it
+            with suppress(OSError):
+                self._stream.close()
+            return
+        self.custom_data[KEY] = self._digest.hexdigest()
+        try:
+            self._mcap.flush()
+            self._add_metadata_record()
+            self._mcap.finish()
+            self._stream.close()
+            metadata.write(self.directory, self._metadata())
+        except OSError as error:
+            self._fail(error)
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _metadata(self) -> dict[str, Any]:
+        topics = [
+            metadata.TopicSummary(name, definition.name, profiles, definition.type_hash, self._counts[channel])
+            for name, (channel, definition, profiles) in self._topics.items()
+        ]
+        start_ns = self._start_ns if self.message_count else 0
+        return metadata.build(self.path.name, topics, start_ns, self._end_ns, self.custom_data, self._ros_distro)
+
+    def _add_metadata_record(self) -> None:
+        self._mcap.add_metadata(metadata.RECORD_NAME, {metadata.RECORD_KEY: metadata.dump(self._metadata())})
+
+    def _check_open(self) -> None:
+        if self._failure:
+            raise BagError(self._failure)
+        if self._closed:
+            raise BagError(f"the bag {self.directory} is closed: nothing more can be recorded to it")
+
+    def _fail(self, error: OSError) -> NoReturn:
+        lost = f", up to {self._unsaved} messages are not saved" if self._unsaved else ""
+        self._failure = (
+            f"recording to {self.path} stopped: {error.strerror or error}{lost}; "
+            f"`{program()} recover {self.directory}` makes a full bag of the rest"
+        )
+        with suppress(OSError):
+            self._stream.close()
+        raise BagError(self._failure) from error
+
+
+KEY = "digest"  # name of the digest in a bag's custom data
+
+_TIMES = struct.Struct("<QQQ")
+_MASK = (1 << 128) - 1
+
+
+class BagDigest:
+    """Running digest of a bag: a dropped, swapped or altered message shows even where nothing else does.
+
+    It is the sum, modulo 2^128, of one BLAKE2b hash a message over topic, times, number on the topic and bytes; so it
+    does not depend on the order of reading. It guards against mishaps and careless edits, not against somebody who
+    writes a new digest as well. A run's random id is left out. Fast CDR leaves the bytes between aligned fields as they
+    happen to be: two recordings of one flight may differ in their digests although no field does.
+    """
+
+    __slots__ = ("_sum",)
+
+    def __init__(self) -> None:
+        self._sum = 0
+
+    def add(
+        self, topic: bytes, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes, run: bool = False
+    ) -> None:
+        """Take in one message.
+
+        :param data: its CDR bytes.
+        :param run: whether it carries a run's id.
+        """
+        state = blake2b(topic, digest_size=16)
+        state.update(_TIMES.pack(log_time_ns, publish_time_ns, sequence))
+        state.update(without_run(data) if run else data)
+        self._sum = (self._sum + int.from_bytes(state.digest(), "little")) & _MASK
+
+    def hexdigest(self) -> str:
+        """The digest so far, 32 hexadecimal digits."""
+        return f"{self._sum:032x}"

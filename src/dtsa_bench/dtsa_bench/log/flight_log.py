@@ -1,0 +1,146 @@
+"""A flight: what happened, what the agents knew of each other, tables, and how it is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dtsa_bench.drawing.card import as_html, as_text
+from dtsa_bench.runs.metrics import CRASHED
+from dtsa_bench.runs.summary_text import result_rows, setting_rows, what_came_of_it, what_flew
+
+from .arrays import FlightArrays
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    import pandas as pd
+
+    from .knowledge import Knowledge
+
+
+class FlightLog(FlightArrays):
+    """A flight, simulated or recorded: arrays with a row a slot and a column an agent, and what follows from them.
+
+    Tables are pandas frames, made when first asked for; their columns: docs/reference/columns.md.
+    """
+
+    # -- what the agents knew -----------------------------------------------------------------------------------------
+    @property
+    def knowledge(self) -> Knowledge:
+        """What the agents knew of each other, and the results; see :mod:`.knowledge`."""
+        from .knowledge import knowledge_of
+
+        return knowledge_of(self)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The results, with the keys of summary.json; empty where the log does not hold enough."""
+        return self.knowledge.summary if self.results is None else self.results
+
+    # -- tables -------------------------------------------------------------------------------------------------------
+    def _table(self, name: str) -> pd.DataFrame:
+        from .tables import table
+
+        self.check_kept()
+        return table(self, name)
+
+    @cached_property
+    def slots(self) -> pd.DataFrame:
+        """A row a slot: slot, time_s (start), outcome, senders (how many), sender (id of the first, 0: nobody).
+
+        :raises ConfigError: if pandas is missing; likewise below.
+        """
+        return self._table("slots")
+
+    @cached_property
+    def frames(self) -> pd.DataFrame:
+        """A row a frame: slot, time_s, sender, received, lost, collided (receivers), length, data, and what it says."""
+        return self._table("frames")
+
+    @cached_property
+    def receptions(self) -> pd.DataFrame:
+        """Who received what, a row a frame and other agent: slot, time_s, sender, receiver, received (or not)."""
+        return self._table("receptions")
+
+    @cached_property
+    def decisions(self) -> pd.DataFrame:
+        """A row an agent and slot: slot, time_s, agent, chosen (id, 0: nobody), reason, score, digest of its table."""
+        return self._table("decisions")
+
+    @cached_property
+    def states(self) -> pd.DataFrame:
+        """A row an agent and instant: time_s, agent, position_{x,y,z}_m, velocity_{x,y,z}_mps, frame map."""
+        return self._table("states")
+
+    @cached_property
+    def ages(self) -> pd.DataFrame:
+        """A row a slot and agent: slot, time_s (end), agent, observers, age_slots, error_m: means over its observers.
+
+        Not a number where nobody still expects the agent to move; no rows where the log does not hold enough.
+        """
+        return self._table("ages")
+
+    @cached_property
+    def ages_by_observer(self) -> pd.DataFrame:
+        """A row a slot, observer and agent: slot, time_s (end), observer, agent, age_slots, error_m, counted.
+
+        That is slots times agents squared: 5 s of 200 agents are 20 million rows.
+        """
+        return self._table("ages_by_observer")
+
+    @cached_property
+    def errors(self) -> pd.DataFrame:
+        """Estimates and the truth, a row a slot and agent: slot, time_s (end), agent, observers, error_m (mean)."""
+        return self.ages[["slot", "time_s", "agent", "observers", "error_m"]]
+
+    @cached_property
+    def distances(self) -> pd.DataFrame:
+        """Smallest distance of any two agents, a row an instant: time_s, distance_m."""
+        return self._table("distances")
+
+    def to_parquet(self, directory: str | Path, tables: Sequence[str] | None = None) -> list[Path]:
+        """Write tables as Parquet files into a directory that is empty or does not exist yet; return the files.
+
+        :param tables: names, such as "slots"; None: all.
+        :raises ConfigError: for a name that does not exist, or a directory that is in use.
+        :raises BagError: if a file cannot be written.
+        """
+        from .tables import export
+
+        return [written.path for written in export(self, directory, tables=tables)]
+
+    # -- how it is shown ----------------------------------------------------------------------------------------------
+    def __repr__(self) -> str:
+        return as_text(self._title, self._rows())
+
+    def _repr_html_(self) -> str:
+        from dtsa_bench.drawing.flight_paths import svg_from_above  # Matplotlib takes longer to load than all the rest
+
+        summary, config = self.summary, self.usable_config
+        crash = summary.get("collided_pair") if summary.get("end") == CRASHED else None
+        shown = self.is_kept and len(self.path)
+        picture = svg_from_above(self.path, self.moving, self._title, crash) if shown else ""
+        folded = [("all settings", setting_rows(config))] if config is not None else []
+        folded += [("all results", result_rows(summary))] if summary else []
+        return as_html(self._title, self._rows(), picture=picture, folded=folded)
+
+    @property
+    def _title(self) -> str:
+        config = self.usable_config
+        what = f"{self.agents} agents" if config is None else what_flew(config)
+        return f"Flight{f' {self.name}' if self.name else ''}: {what}"
+
+    def _rows(self) -> list[tuple[str, str]]:
+        config = self.usable_config
+        rows = [] if config is None else what_came_of_it(self.summary, config)
+        counts = f"{int(self.recorded.sum())} slots, {int(self.sent.sum())} frames, {int(self.known.sum())} decisions"
+        if not self.is_kept:
+            counts = "without what happened in its slots (trace=False)"
+        rows.append(("log", f"{counts}; missing: {self.missing}" if self.missing else counts))
+        rows += [("note", note) for note in (self.notes if self.results is not None else self.knowledge.notes)]
+        rows.append(("kept", "in memory" if self.file is None else str(self.file)))
+        more = "summary, config, slots, frames, decisions, states, ages; dtsa.plot_trajectories(flight)"
+        return [*rows, ("more", more)]

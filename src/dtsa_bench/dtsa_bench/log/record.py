@@ -1,0 +1,374 @@
+"""The record of a flight: messages `dtsa_msgs/SlotRecord` of a bag, written and read. Needs no ROS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.packing import pack_received, unpack_received
+from dtsa_bench.log.bag import schema
+from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
+from dtsa_bench.log.bag.reader import Bag, Message
+
+from .arrays import PRESENT, UNKNOWN, HeardFrames, swarm_section
+from .flight_log import FlightLog
+
+SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
+CONFIGURATION = "dtsa_msgs/msg/Configuration"
+FORMAT, FORMAT_KEY = "2", "format"  # of bags, and its name in custom data
+AGENT, SNIFFER = "agent", "sniffer"  # custom data: what the record of one agent, or of a listener, says of itself
+_OF_FORMAT_1 = {f"{names.SWARM}/{topic}" for topic in (names.RECEPTION, names.TRANSMISSION, names.DECISION)}
+_SECOND = 1_000_000_000
+_KINDS = {
+    "agent": "u2", "presence": "u1", "chosen": "u2", "reason": "u1", "digest": "u4", "score": "f8", "offset_ns": "i8",
+    "track": "f8", "velocity": "f8", "command": "f8", "goal": "f8", "sender": "u2", "length": "u1", "data": "u1",
+    "sent_ns": "i8", "received": "u1", "lost": "u2", "collided": "u2", "heard_sender": "u2", "heard_slot": "u4",
+    "heard_ns": "i8", "heard_by": "u1", "heard_before": "u1", "heard_length": "u1", "heard_data": "u1",
+}  # fmt: skip
+_NOTHING = {name: np.zeros(0, kind) for name, kind in _KINDS.items()}
+_DECIDED = ("chosen", "reason", "digest", "score")
+
+
+@cache
+def _store() -> Any:
+    store = get_typestore(Stores.EMPTY)
+    for kind in (TYPE, CONFIGURATION):
+        found = get_types_from_msg(schema.installed(kind).text, kind)
+        store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
+    return store
+
+
+def _header(time_ns: int) -> Any:
+    stamp = _store().types["builtin_interfaces/msg/Time"](*divmod(time_ns, _SECOND))
+    return _store().types["std_msgs/msg/Header"](stamp, names.FRAME)
+
+
+def pack_configuration(run: int, settings: Mapping[str, Any]) -> bytes:
+    """A dtsa_msgs/Configuration as CDR."""
+    text = json.dumps(settings, sort_keys=True)
+    message = _store().types[CONFIGURATION](_header(names.TIME_ZERO_NS), run, str(settings["mode"]), text)
+    return bytes(_store().serialize_cdr(message, CONFIGURATION))
+
+
+def pack_record(run: int, slot: int, time_ns: int, steps: int, outcome: int = UNKNOWN, **fields: Any) -> bytes:
+    """A SlotRecord as CDR.
+
+    :param time_ns: ns, when the slot starts, by the clock of the record.
+    :param fields: arrays of any shape in the message's order of elements; what is not given is empty.
+    """
+    arrays = {name: np.ascontiguousarray(values, _KINDS[name]).ravel() for name, values in fields.items()}
+    head = {"header": _header(time_ns), "run": run, "slot": slot, "outcome": outcome, "steps": steps}
+    return bytes(_store().serialize_cdr(_store().types[TYPE](**head, **_NOTHING | arrays), TYPE))
+
+
+def frame_fields(frames: Mapping[int, bytes], received: NDArray[np.bool_] | None) -> dict[str, Any]:
+    """The fields of frames that were sent.
+
+    :param frames: by the sender's id, ascending.
+    :param received: (F, N) who received them; None: not known.
+    """
+    return {
+        "sender": list(frames),
+        "length": [len(data) for data in frames.values()],
+        "data": np.frombuffer(b"".join(frames.values()), np.uint8),
+        "received": [] if received is None or not frames else np.frombuffer(pack_received(received), np.uint8),
+    }
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+def load_log(source: Bag | str | Path) -> FlightLog:
+    """The log of a recorded flight.
+
+    :param source: run directory, bag directory or .mcap file; or an open bag.
+    :raises UnusableBag: if it is no bag of this project, of another format, or its records do not fit together.
+    """
+    if not isinstance(source, Bag):
+        with Bag(source) as bag:
+            return load_log(bag)
+    check_format(source)
+    return build_log(source, (source.decode(message) for message in source.messages([SLOT_RECORD])))
+
+
+def check_format(bag: Bag) -> None:
+    """Whether a bag holds slot records.
+
+    :raises UnusableBag: if it does not.
+    """
+    if SLOT_RECORD in bag.topics:
+        return
+    if _OF_FORMAT_1 & set(bag.topics):
+        raise UnusableBag(bag.given, f"it has bag format 1, and this version reads format {FORMAT}: record it again")
+    bag.config  # noqa: B018  says what is wrong with a foreign bag
+    raise UnusableBag(bag.given, f"it has no {SLOT_RECORD}: no flight of a swarm")
+
+
+def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
+    """The log that decoded records of a bag make.
+
+    :raises UnusableBag: if they do not fit together.
+    """
+    settings = bag.config
+    merged = _merged(bag)
+    swarm = swarm_section(settings)
+    agents, slot_ms = swarm.get("agents", 0), swarm.get("slot_ms", 10.0)
+    if not isinstance(agents, int) or not 0 < agents <= 65535:
+        raise UnusableBag(bag.given, "its configuration does not say how many agents there are")
+    slot_ns = round(float(slot_ms) * 1e6) if isinstance(slot_ms, (int, float)) and slot_ms > 0 else 10_000_000
+    found = list(records)
+    try:
+        is_whole = merged is None and not {AGENT, SNIFFER} & set(bag.custom_data)
+        log = _Rows(found, agents, slot_ns, is_whole).log(_name(bag), settings)
+    except (ValueError, IndexError, TypeError) as error:
+        raise UnusableBag(bag.given, f"its slot records do not fit together ({error})") from None
+    log.file, log.version = bag.path, bag.custom_data.get("version", "")
+    if RECOVERED_FROM in bag.custom_data:
+        log.notes.append("This bag was recovered: its recorder was killed or its file was damaged.")
+    if merged is None:
+        return log
+    log.merged = merged
+    return split_log(log, int(merged["common_slot"]))
+
+
+def log_of_fields(
+    fields: Iterable[tuple[int, Mapping[str, Any]]],
+    name: str,
+    settings: dict[str, Any],
+    slot_ns: int,
+    merged: dict[str, Any],
+) -> FlightLog:
+    """The log of a merged flight from the fields of its records, by slot, as :func:`pack_record` takes them."""
+    records = []
+    for slot, values in fields:
+        arrays = {key: np.ascontiguousarray(values.get(key, ()), kind).ravel() for key, kind in _KINDS.items()}
+        head = {"header": _header(names.slot_time_ns(slot, slot_ns)), "slot": slot}
+        records.append(SimpleNamespace(**head, outcome=values["outcome"], steps=values["steps"], **arrays))
+    log = _Rows(records, int(settings["swarm"]["agents"]), slot_ns, False).log(name, settings)
+    log.merged = merged
+    return split_log(log, int(merged["common_slot"]))
+
+
+def _merged(bag: Bag) -> dict[str, Any] | None:
+    """What a bag was merged from; None: it was recorded in flight.
+
+    :raises UnusableBag: if what it says of that cannot be read.
+    """
+    if MERGED_FROM not in bag.custom_data:
+        return None
+    try:
+        about = json.loads(bag.custom_data[MERGED_FROM])
+        if not isinstance(about["common_slot"], int) or about["common_slot"] < 0:
+            raise ValueError("common_slot")
+        for key in ("missing", "broken_off", "not_on_the_time_line", "nothing_written", "not_determined", "processes"):
+            if not isinstance(about[key], list):
+                raise ValueError(key)
+        if not all(isinstance(about["residual_us"][key], float) for key in ("p50", "p99")):
+            raise ValueError("residual_us")
+        if not isinstance(about["frames_heard_not_as_sent"], int):
+            raise ValueError("frames_heard_not_as_sent")
+    except (ValueError, KeyError, TypeError) as error:
+        raise UnusableBag(bag.given, f"what it says of the bags it was merged from cannot be read ({error})") from None
+    return dict(about)
+
+
+def _name(bag: Bag) -> str:
+    """A name for the flight: that of its directory, where `fly` keeps the bag as `bag` beside the results."""
+    if not bag.given.is_dir():
+        return bag.path.stem
+    directory = bag.path.resolve().parent
+    return directory.parent.name if directory.name == "bag" else directory.name
+
+
+class _Rows:
+    """Puts records into arrays.
+
+    :raises ValueError: if they do not fit together.
+    """
+
+    def __init__(self, records: Sequence[Any], agents: int, slot_ns: int, is_whole: bool) -> None:
+        slots = [int(record.slot) for record in records]
+        self.agents, self.slot_ns = agents, slot_ns
+        self._first = 0 if is_whole else min(slots, default=0)
+        last = max(slots, default=-1)
+        if last - self._first > 2 * len(slots) + 1000 or len(set(slots)) < len(slots):
+            raise ValueError("most slots are missing, or a number is damaged")
+        end = None
+        if records and is_whole:  # the last one says where all are at the end, and may say no more
+            end = max(records, key=lambda record: int(record.slot))
+        rows = last - self._first + (end is None)
+        steps = max((int(record.steps) for record in records), default=1)
+        shape, planes = (rows, agents), (rows, 3, agents)
+        self._arrays: dict[str, Any] = {
+            "recorded": np.zeros(rows, np.bool_), "start_ns": np.arange(rows) * slot_ns, "known": np.zeros(shape, np.bool_),
+            "outcome": np.full(rows, UNKNOWN, np.uint8), "length": np.zeros(shape, np.uint8),
+            "lost": np.zeros(shape, np.uint16), "collided": np.zeros(shape, np.uint16),
+            "chosen": np.zeros(shape, np.uint16), "reason": np.zeros(shape, np.uint8),
+            "digest": np.zeros(shape, np.uint32), "score": np.zeros(shape), "offset_ns": np.zeros(shape, np.int64),
+            "sent_ns": np.zeros(shape, np.int64), "presence": np.zeros(shape, np.uint8),
+            "track": np.full((rows + 1, max(1, steps), 3, agents), np.nan),
+            **{name: np.full(planes, np.nan) for name in ("velocity", "command", "goal")},
+        }  # fmt: skip
+        self._frames: dict[tuple[int, int], bytes] = {}  # by row and sender
+        self._received: dict[tuple[int, int], NDArray[np.bool_]] = {}
+        self._heard: list[tuple[int, int, int, int, NDArray[np.bool_], bool, bytes]] = []
+        self._has_presence = self._own_clocks = False
+        for record in records:
+            if record is not end:
+                self._add(record)
+        if end is not None:
+            self._end(end)
+        self.has_end = end is not None
+
+    def _columns(self, record: Any) -> NDArray[np.intp]:
+        index = np.asarray(record.agent, np.intp) - 1
+        if len(index) and (index[0] < 0 or index[-1] >= self.agents or (np.diff(index) <= 0).any()):
+            raise ValueError(f"slot {record.slot}: agents {record.agent.tolist()}")
+        return index
+
+    def _end(self, record: Any) -> None:
+        at = self._columns(record)
+        track = self._arrays["track"]
+        track[int(record.slot) - self._first][:, :, at] = record.track.reshape(track.shape[1], 3, len(at))
+
+    def _add(self, record: Any) -> None:
+        arrays, row, at = self._arrays, int(record.slot) - self._first, self._columns(record)
+        count, steps = len(at), arrays["track"].shape[1]
+        arrays["recorded"][row], arrays["outcome"][row] = True, min(int(record.outcome), UNKNOWN)
+        stamp = record.header.stamp
+        arrays["start_ns"][row] = int(stamp.sec) * _SECOND + int(stamp.nanosec) - names.TIME_ZERO_NS
+        arrays["known"][row, at] = True
+        for name in _DECIDED:
+            values = getattr(record, name)
+            if len(values) != count:
+                raise ValueError(f"slot {record.slot}: {len(values)} entries in {name}, {count} agents")
+            arrays[name][row, at] = values
+        if len(record.offset_ns):
+            arrays["offset_ns"][row, at] = record.offset_ns
+        arrays["presence"][row, at] = record.presence if len(record.presence) else PRESENT
+        self._has_presence = self._has_presence or len(record.presence) > 0
+        arrays["track"][row][:, :, at] = record.track.reshape(steps, 3, count)
+        for name in ("velocity", "command", "goal"):
+            arrays[name][row][:, at] = getattr(record, name).reshape(3, count)
+        self._add_frames(record, row)
+        self._add_heard(record, row)
+
+    def _add_frames(self, record: Any, row: int) -> None:
+        arrays, senders = self._arrays, record.sender.tolist()
+        if senders != sorted(set(senders)) or (senders and not 1 <= senders[0] <= senders[-1] <= self.agents):
+            raise ValueError(f"slot {record.slot}: senders {senders}")
+        frames = cut_frames(record.data, record.length, len(senders))
+        columns = np.array(senders, np.intp) - 1
+        for name in ("lost", "collided"):
+            arrays[name][row, columns] = getattr(record, name)
+        arrays["length"][row, columns] = record.length
+        if len(record.sent_ns):
+            self._own_clocks = True
+            arrays["sent_ns"][row, columns] = record.sent_ns
+        received = np.zeros((len(senders), self.agents), np.bool_)
+        if len(record.received):
+            received[:] = unpack_received(record.received.tobytes(), len(senders), self.agents)
+        for sender, data, mask in zip(senders, frames, received, strict=True):
+            if not data:
+                raise ValueError(f"slot {record.slot}: an empty frame of cf{sender}")
+            self._frames[row, sender], self._received[row, sender] = data, mask
+
+    def _add_heard(self, record: Any, row: int) -> None:
+        count = len(record.heard_sender)
+        self._own_clocks = self._own_clocks or count > 0 or len(record.offset_ns) > 0
+        if not count:
+            return
+        by = unpack_received(record.heard_by.tobytes(), count, self.agents).astype(np.bool_)
+        before = record.heard_before if len(record.heard_before) else np.zeros(count, np.uint8)
+        data = cut_frames(record.heard_data, record.heard_length, count) if len(record.heard_length) else [b""] * count
+        times = (record.heard_ns + self._arrays["start_ns"][row]).tolist()
+        columns = record.heard_sender.tolist(), record.heard_slot.tolist(), times, by, before.tolist(), data
+        for sender, slot, time_ns, mask, early, frame in zip(*columns, strict=True):
+            self._heard.append((row, sender, slot, time_ns, mask, bool(early), frame))
+
+    def log(self, name: str, settings: dict[str, Any]) -> FlightLog:
+        """The log."""
+        arrays, keys = self._arrays, sorted(self._frames)
+        received = np.array([self._received[key] for key in keys], np.bool_).reshape(len(keys), self.agents)
+        heard = self._heard_frames() if self._own_clocks else None
+        presence, sent_ns = arrays.pop("presence"), arrays.pop("sent_ns")
+        return FlightLog(
+            name=name, settings=settings, agents=self.agents, slot_ns=self.slot_ns,
+            data=b"".join([self._frames[key] for key in keys]), received=received, heard=heard,
+            presence=presence if self._has_presence else None, sent_ns=sent_ns if self._own_clocks else None,
+            first_slot=self._first, has_end=self.has_end, **arrays,
+        )  # fmt: skip
+
+    def _heard_frames(self) -> HeardFrames:
+        frames = [
+            data or self._frames.get((slot - self._first, sender), b"")
+            for _, sender, slot, _, _, _, data in self._heard
+        ]
+        columns = list(zip(*self._heard, strict=True)) if self._heard else [()] * 7
+        numbers = [np.array(column, np.int64) for column in columns[:4]]
+        by = np.array(columns[4], np.bool_).reshape(len(frames), self.agents)
+        return HeardFrames(*numbers, by, np.array(columns[5], np.bool_), frames)
+
+
+def cut_frames(data: NDArray[np.uint8], lengths: NDArray[np.uint8], count: int) -> list[bytes]:
+    """Frames that lie one after the other."""
+    if len(lengths) != count or int(lengths.sum(dtype=np.int64)) != len(data):
+        raise ValueError(f"{len(data)} bytes of {count} frames")
+    ends = np.cumsum(lengths, dtype=np.int64).tolist()
+    whole = data.tobytes()
+    return [whole[end - int(length) : end] for end, length in zip(ends, lengths, strict=True)]
+
+
+def split_log(log: FlightLog, slot: int) -> FlightLog:
+    """A log from a slot on; those before are kept as `earlier`."""
+    row = slot - log.first_slot
+    if not 0 <= row <= len(log):
+        raise UnusableBag(log.file or log.name, f"slot {slot}, the first common one, is not in it")
+    earlier, later = _slice(log, 0, row), _slice(log, row, len(log))
+    later.earlier = earlier if row else None
+    return later
+
+
+def _slice(log: FlightLog, first: int, last: int) -> FlightLog:
+    fields: dict[str, Any] = {name: getattr(log, name) for name in log.__dataclass_fields__}
+    for name, values in fields.items():
+        if isinstance(values, np.ndarray) and name not in ("received", "track"):
+            fields[name] = values[first:last]
+    ends = np.concatenate(([0], np.cumsum(log.length.sum(axis=1, dtype=np.int64))))
+    counts = np.concatenate(([0], np.cumsum(log.sent.sum(axis=1))))
+    fields["track"] = log.track[first : last + 1]
+    fields["data"] = log.data[int(ends[first]) : int(ends[last])]
+    fields["received"] = log.received[int(counts[first]) : int(counts[last])]
+    if log.heard is not None:
+        a, b = np.searchsorted(log.heard.row, (first, last)).tolist()
+        heard = HeardFrames(*(values[a:b] for values in log.heard))
+        fields["heard"] = heard._replace(row=heard.row - first, time_ns=heard.time_ns - first * log.slot_ns)
+    fields["first_slot"] = log.first_slot + first
+    return FlightLog(**fields)
+
+
+def unpack_record(data: bytes) -> Any:
+    """A SlotRecord from its CDR, by this version's definition.
+
+    :raises Exception: of any kind, as rosbags does, if it is none.
+    """
+    return _store().deserialize_cdr(data, TYPE)
+
+
+def decode_record(bag: Bag, message: Message) -> Any:
+    """A record of a bag.
+
+    :raises BagError: if it is none.
+    """
+    record = bag.decode(message)
+    if message.type != TYPE:
+        raise BagError(f"{message.topic}: {message.type} instead of {TYPE}")
+    return record

@@ -1,0 +1,257 @@
+"""Whether frames on the air are what the protocol allows: two senders in a slot, out of turn, turns given twice.
+
+The rules are judged from frames alone, by an outside observer that shares no code with the agents that run: it knows
+what was sent, not what was heard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import RemoteProtocolError
+from dtsa_agent.core.frame import decode_extended
+
+_TOLD = 10  # broken rules
+
+
+OPEN = 255
+
+
+def is_anchor(slot: int, agents: int, every: int) -> bool:
+    """Whether a slot is an anchor of its owner: (R + T mod N) mod M = 0; a main one with K M for M."""
+    return (slot // agents + slot % agents) % every == 0
+
+
+@dataclass(slots=True)
+class Ledger:
+    """Who gave which turn to whom, and whether all kept to it.
+
+    :param main_every: K M; 0: M.
+    """
+
+    agents: int
+    anchor_every: int
+    main_every: int = 0
+    issued: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # turn -> (issuer, lessee)
+    handed: dict[int, dict[int, tuple[int, int]]] = field(default_factory=dict)  # turn -> lessee -> (next one, slot)
+    quiet: dict[int, int] = field(default_factory=dict)  # last slot in which each was in probation
+    open_collisions: int = 0  # slots with two senders that had been given to all who wake
+    adopted_collisions: int = 0  # slots with two senders, given away by somebody other than their owner
+    anchor_collisions: int = 0  # ... in an anchor that its owner gave away before it restarted
+    handed_collisions: int = 0  # ... in a turn that a lessee handed on before it restarted
+    plain_collisions: int = 0  # any other slot with two senders
+    leased_slots: int = 0
+    broken: list[str] = field(default_factory=list)  # rules that were broken, in words
+
+    def _is_anchor(self, slot: int) -> bool:
+        """Whether nobody but its owner may give a slot away."""
+        return is_anchor(slot, self.agents, self.anchor_every)
+
+    def _is_main(self, slot: int) -> bool:
+        """Whether a slot is its owner's whatever happens."""
+        return is_anchor(slot, self.agents, self.main_every or self.anchor_every)
+
+    def _turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
+        """The turns that the lease bytes of a frame speak of, in order.
+
+        T + j N - i for j = 1 .. K M, and within each j for i = c_s .. 0; anchors of others (i > 0) are left out, and of
+        the sender's own turns (i = 0) those from its next main anchor on.
+        """
+        turns, own = [], True
+        for j in range(1, (self.main_every or self.anchor_every) + 1):
+            for i in range(c_s, -1, -1):
+                turn = slot + j * self.agents - i
+                own = own and not (i == 0 and self._is_main(turn))
+                if not self._is_anchor(turn) if i > 0 else own:
+                    turns.append(turn)
+        return turns[:room]
+
+    def slot(self, slot: int, frames: dict[int, bytes]) -> None:
+        """Takes in one slot."""
+        given, handed = self.issued.pop(slot, []), self.handed.pop(slot, {})
+        owner = slot % self.agents + 1
+        is_open = any(lessee == OPEN for _, lessee in given)
+        adopted = any(issuer != owner for issuer, _ in given)
+        self.leased_slots += bool(given) and not is_open and not adopted
+        if len(frames) > 1:
+            self.open_collisions += is_open
+            self.adopted_collisions += adopted and not is_open
+            taken_back = not is_open and not adopted and self._taken_back(slot, frames.get(owner))
+            forgotten = not is_open and not adopted and any(self._forgotten(handed, sender) for sender in frames)
+            self.anchor_collisions += taken_back
+            self.handed_collisions += forgotten and not taken_back
+            if not (is_open or adopted or taken_back or forgotten):
+                self.plain_collisions += 1
+                self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}, handed on {handed}")
+        for sender, data in frames.items():
+            self._check_sender(slot, sender, owner, given, data, handed)
+            self.read(slot, sender, data)
+
+    def _taken_back(self, slot: int, data: bytes | None) -> bool:
+        """Whether the owner sends in an anchor, no main one, in probation: it may have given it away before."""
+        if data is None or not self._is_anchor(slot) or self._is_main(slot):
+            return False
+        return decode_extended(data).probation
+
+    def _forgotten(self, handed: dict[int, tuple[int, int]], sender: int) -> bool:
+        """Whether a sender handed the turn on before it began anew: what others relay may be all that it knows."""
+        return sender in handed and self.quiet.get(sender, -1) > handed[sender][1]
+
+    def _check_sender(
+        self,
+        slot: int,
+        sender: int,
+        owner: int,
+        given: list[tuple[int, int]],
+        data: bytes,
+        handed: dict[int, tuple[int, int]],
+    ) -> None:
+        last = {last_lessee(handed, lessee) for _, lessee in given}
+        if sender in last or OPEN in last or self._forgotten(handed, sender):
+            return
+        if sender != owner:
+            self.broken.append(f"slot {slot}: agent {sender} sends in a turn of {owner} given to {sorted(last)}")
+        elif any(issuer == owner for issuer, _ in given) and not self._taken_back(slot, data):
+            self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(last)}")
+
+    def read(self, slot: int, sender: int, data: bytes) -> None:
+        """Takes note of what a frame gives away, whether or not it got on the air."""
+        try:
+            frame = decode_extended(data)
+        except RemoteProtocolError as error:
+            self.broken.append(f"slot {slot}: agent {sender} sent a frame that is none: {error}")
+            return
+        if frame.probation:
+            self.quiet[sender] = slot
+        if frame.c_s and (frame.probation or frame.leaving):
+            self.broken.append(f"slot {slot}: agent {sender} claims others dead in probation, or as it leaves")
+        leases = frame.leases
+        if leases and slot % self.agents != sender - 1:
+            self.broken.append(f"slot {slot}: agent {sender} gives turns away in somebody else's turn")
+        for turn, lessee in zip(self._turns_of_leases(slot, frame.c_s, len(leases)), leases, strict=False):
+            if not lessee:
+                continue
+            owner = turn % self.agents + 1
+            if self._is_main(turn) or turn <= slot:
+                self.broken.append(f"slot {slot}: agent {sender} gives away turn {turn}")
+            entries, handed = self.issued.setdefault(turn, []), self.handed.get(turn, {})
+            if any(issuer == sender and lessee in lessees(handed, first) for issuer, first in entries):
+                continue  # said again
+            if sender == owner and any(issuer == owner for issuer, _ in entries):
+                self.broken.append(f"slot {slot}: agent {sender} gives turn {turn} away a second time")
+            if (sender, lessee) not in entries:
+                entries.append((sender, lessee))
+        for ahead, lessee in (*frame.relay, *((far, frame.far_lessee) for far in frame.far)):
+            self._hand_on(slot, sender, slot + ahead, lessee)
+
+    def _hand_on(self, slot: int, sender: int, turn: int, lessee: int) -> None:
+        """Whose turn it is names another one for it; everybody else only relays."""
+        chain = self.handed.get(turn, {})
+        given = [first for _, first in self.issued.get(turn, [])]
+        before = {sender, *given, *chain}  # who was given it and does not know it yet, relays one of these
+        if lessee in before or all(last_lessee(chain, first) != sender for first in given):
+            return
+        if lessee in (OPEN, turn % self.agents + 1) or self._is_main(turn):
+            self.broken.append(f"slot {slot}: agent {sender} hands turn {turn} on to {lessee}")
+        elif sender not in chain:
+            self.handed.setdefault(turn, {})[sender] = (lessee, slot)
+
+
+def last_lessee(handed: dict[int, tuple[int, int]], lessee: int) -> int:
+    """Whose turn it is after it has been handed on, each agent once."""
+    return lessees(handed, lessee)[-1]
+
+
+def lessees(handed: dict[int, tuple[int, int]], first: int) -> list[int]:
+    """Whose a turn was, one after the other."""
+    chain = [first]
+    while chain[-1] in handed and len(chain) <= len(handed):
+        chain.append(handed[chain[-1]][0])
+    return chain
+
+
+class Judge:
+    """Reads the frames of a swarm slot by slot.
+
+    What was given away before it began it cannot know: unless it begins with slot 0, it only listens for as long as
+    leases reach.
+    """
+
+    def __init__(self, config: SwarmConfig) -> None:
+        self._config = config
+        rounds = config.anchor_every, config.main_every
+        self._ledger = Ledger(config.agents, *rounds) if config.policy == "lease" else None
+        self._window = (config.main_every + 2) * config.agents if self._ledger else 0
+        self._from: int | None = None  # slot
+        self.broken: list[str] = []
+        self._known_from = 0  # slot from which on no turn depends on a frame that nobody has recorded
+        self.slots = self.frames = 0
+        self.unjudged = 0  # slots that may depend on such a frame
+        self.double = 0  # slots with two senders or more
+
+    def slot(
+        self,
+        slot: int,
+        frames: Mapping[int, bytes],
+        unsent: Mapping[int, bytes] | None = None,
+        unrecorded: Collection[int] = (),
+    ) -> None:
+        """A slot in which frames were sent.
+
+        :param frames: the frames as they were on the air, by the sender's id.
+        """
+        if self._from is None:
+            self._from = slot + self._window if slot else 0
+        if self._ledger is not None:
+            said = {agent: self._config.protocol_part(data, sealed=True) for agent, data in frames.items()}
+            self._ledger.slot(slot, said)
+            for agent, data in (unsent or {}).items():
+                self._ledger.read(slot, agent, self._config.protocol_part(data))
+            found, self._ledger.broken = self._ledger.broken, []
+        else:
+            found = self._turns(slot, frames)
+        if unrecorded:
+            self._known_from = slot + self._window
+        if slot < self._from:
+            return
+        if found and slot < self._known_from:
+            self.unjudged += 1
+            return
+        self.slots += 1
+        self.frames += len(frames)
+        self.double += len(frames) > 1
+        self.broken += found
+
+    def _turns(self, slot: int, frames: Mapping[int, bytes]) -> list[str]:
+        """With a policy of fixed turns, who has sent out of turn; with others nobody can."""
+        owner = slot % self._config.agents + 1
+        if self._config.policy != "tdma":
+            return []
+        return [f"slot {slot}: agent {agent} sends in a turn of {owner}" for agent in frames if agent != owner]
+
+    @property
+    def knows_rules(self) -> bool:
+        """Whether the policy has rules that frames alone can break."""
+        return self._ledger is not None or self._config.policy == "tdma"
+
+    def summary(self) -> dict[str, Any]:
+        """What was found."""
+        ledger = self._ledger
+        shared = {} if ledger is None else {
+            "two_senders_in_open_turns": ledger.open_collisions,
+            "two_senders_in_adopted_turns": ledger.adopted_collisions,
+            "two_senders_in_anchors_given_away": ledger.anchor_collisions,
+            "two_senders_in_turns_handed_on": ledger.handed_collisions,
+        }  # fmt: skip
+        return {
+            "slots_judged": self.slots,
+            "slots_not_judged": self.unjudged,
+            "frames_judged": self.frames,
+            "slots_with_two_senders": self.double,
+            **shared,
+            "rules_broken": len(self.broken),
+            "which": self.broken[:_TOLD],
+        }

@@ -1,0 +1,1 @@
+"""Verification: field by field, what a recorded flight holds is compared with what replayed agents give."""

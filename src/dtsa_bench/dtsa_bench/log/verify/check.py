@@ -1,0 +1,113 @@
+"""Is a recorded flight what the protocol gives? Slot by slot, agent by agent, field by field."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.log.arrays import FlightArrays, recorded_config
+from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.metadata import MERGED_FROM
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.writer import BROKEN_OFF
+from dtsa_bench.log.agent_bag import find_bags
+from dtsa_bench.log.merged_bag import merge_bags
+from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, build_log, check_format
+from dtsa_bench.log.rules import Judge
+from dtsa_bench.runs.config import LOCKSTEP, REALTIME
+from dtsa_bench.runs.hearing import recorded_problem
+
+from .contents import EVENTS, MERGED, BagContents
+from .lockstep import LockstepCheck
+from .merged import check_merged
+from .realtime import RealtimeCheck
+from .result import Difference, Mismatch, Result
+
+
+def verify_bag(path: str | Path, progress: Callable[[int], None] | None = None) -> Result:
+    """Check a recorded flight.
+
+    :param progress: is called with the slot now and then.
+    :raises UnusableBag: if it cannot be read as a bag of this project at all.
+    """
+    begin = time.perf_counter()
+    if bags := find_bags(path):
+        result = Result(str(path), AGENT)
+        _noting(result, lambda: _verify_agents(bags, result))
+    else:
+        with Bag(path) as bag:
+            check_format(bag)
+            result = Result(str(path), _mode(bag), broken_off=BROKEN_OFF in bag.custom_data)
+            _noting(result, lambda: _verify(bag, result, progress))
+            result.unheard = result.unheard or recorded_problem(bag.path)
+    result.wall_time_s = time.perf_counter() - begin
+    return result
+
+
+def _mode(bag: Bag) -> str:
+    """What kind of flight, or of record of one, a bag holds."""
+    for key, mode in ((MERGED_FROM, MERGED), (AGENT, AGENT), (SNIFFER, SNIFFER)):
+        if key in bag.custom_data:
+            return mode
+    return str(bag.config.get("mode", LOCKSTEP))
+
+
+def _noting(result: Result, check: Callable[[], None]) -> None:
+    """Check, and note the first difference."""
+    try:
+        check()
+    except Mismatch as mismatch:
+        result.difference = mismatch.difference
+    except UnusableBag as error:
+        result.difference = Difference("the file", "a readable bag", "a damaged one", str(error))
+    except ConfigError as error:
+        result.difference = Difference("the recorded configuration", error.allowed, repr(error.value), error.field)
+    except BagError as error:
+        result.difference = Difference("a message", "valid CDR of its type", "other bytes", str(error))
+
+
+def _verify_agents(bags: Sequence[Path], result: Result) -> None:
+    """The agents' bags of a flight, joined."""
+    check_merged(merge_bags(bags), result)
+
+
+def _check_sniffed(log: FlightArrays, result: Result) -> None:
+    """What a listener heard: frames tell of themselves whether they keep to the rules."""
+    judge, slots = Judge(log.config.swarm), log.sent_frames
+    frames: dict[int, dict[int, bytes]] = {}
+    for row, sender, data in zip(slots.row.tolist(), slots.sender.tolist(), slots.data, strict=True):
+        frames.setdefault(row + log.first_slot, {})[sender] = data
+    for slot in sorted(frames):
+        judge.slot(slot, frames[slot])
+    result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
+    result.take_judgement(judge)
+    result.skipped["decisions"] = "a listener does not know them"
+
+
+def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) -> None:
+    mode = result.mode
+    # Missions say what they fly with instead of a mode of runs.
+    settings = bag.config if mode in (LOCKSTEP, MERGED) else {**bag.config, "mode": REALTIME}
+    swarm = recorded_config(settings).swarm
+    contents = BagContents(bag, swarm.slot_ns, swarm.agents, result)
+    if mode == AGENT:
+        _verify_agents([bag.path], result)
+        return
+    log = build_log(bag, contents.records)
+    if mode == MERGED:
+        check_merged(log, result)
+    elif mode == SNIFFER:
+        _check_sniffed(log, result)
+    elif mode == LOCKSTEP:
+        LockstepCheck(log, contents, result, progress).check()
+    else:
+        RealtimeCheck(log, contents, result).check()
+    contents.check_odometry(log)
+    contents.check_digest()
+    for topic in bag.topics:
+        if topic not in (SLOT_RECORD, EVENTS) and not topic.endswith("/odom"):
+            result.skipped[topic] = "carries nothing that is not in other topics; covered by the digest"
+
+

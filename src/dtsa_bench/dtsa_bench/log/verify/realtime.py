@@ -1,0 +1,229 @@
+"""Checks a flight of agents with clocks of their own, or of vehicles that are not simulated."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import RemoteProtocolError, SwarmConfig, decode_frame
+from dtsa_agent.core.authentication import Authenticator
+from dtsa_agent.core.frame import (
+    TAG_LENGTH,
+    ExtendedFrame,
+    Frame,
+    decode_extended,
+    encode_extended,
+    encode_frame,
+)
+from dtsa_agent.keys import VARIABLE
+from dtsa_bench.log.arrays import FlightArrays
+from dtsa_bench.log.replay import replay_log
+from dtsa_bench.log.rules import Judge
+from dtsa_bench.runs.config import REALTIME, RunConfig
+from dtsa_bench.runs.hearing import Hearing
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
+
+from .contents import BagContents, recorded_summary
+from .differences import WHY, first_difference
+from .on_air import FramesOnAir
+from .result import Difference, Mismatch, Result
+
+_SLOT_MASK = 0xFFFFFFFF  # slots have 32 bits in frames
+
+
+class RealtimeCheck:
+    """A flight that cannot be flown again bit for bit, because it depends on when things happened.
+
+    What frames, times, verdicts and decisions must have in common is checked all the same.
+    """
+
+    def __init__(self, log: FlightArrays, contents: BagContents, result: Result) -> None:
+        self._log, self._contents, self._result = log, contents, result
+        self._own_clocks = result.mode == REALTIME
+        # Missions say what they fly with instead of a mode of runs.
+        self.run = RunConfig.from_dict({**log.settings, "mode": REALTIME})
+        self.frames = FramesOnAir.of_log(log, self.run.air, self._own_clocks)
+
+    def check(self) -> None:
+        """Go through the flight.
+
+        :raises Mismatch: at the first difference.
+        """
+        log, result = self._log, self._result
+        result.slots, result.simulated_s = len(log), len(log) * self.run.swarm.slot_s
+        own_states = OwnStates(self.run.swarm, result)
+        check_own_states(log, own_states)
+        result.count("slot records", len(log))
+        self._check_outcomes()
+        self.frames.check_numbers()
+        result.count("frames that nobody heard together with another", self.frames.check_overlaps())
+        summary = self._summary()
+        if self._own_clocks and (self.run.air.range_m or self.run.air.capture_db):
+            result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
+        else:
+            result.count("verdicts made again", self.frames.check_verdicts(self._contents.changes))
+        if self._own_clocks:
+            self._check_decisions(own_states, summary)
+        else:
+            result.skipped["decisions and motion"] = (
+                "they depend on when each message reached each process, which the bag does not hold"
+            )
+        self._judge()
+        result.safety |= self.frames.safety()
+        if self._own_clocks:
+            self._note_spread()
+
+    def _check_outcomes(self) -> None:
+        log = self._log
+        right = np.where(log.collided.any(axis=1), COLLISION, np.where(log.sent.any(axis=1), SUCCESS, IDLE))
+        wrong = np.flatnonzero(log.recorded & (right != log.outcome))
+        if len(wrong):
+            row = int(wrong[0])
+            raise Mismatch(Difference("outcome", str(right[row]), str(log.outcome[row]), WHY["outcome"], row))
+
+    def _check_decisions(self, own_states: OwnStates, summary: dict[str, Any]) -> None:
+        """What agents took in had been delivered to them, and their decisions follow from it."""
+        log, result = self._log, self._result
+        assert log.heard is not None
+        count, delays = self.frames.check_heard(log.heard, len(log))
+        result.count("frames taken in as they were delivered", count)
+        hearing = Hearing(log.agents)
+        hearing.slots, hearing.sent = len(log), int(log.sent.sum())
+        hearing.delivered, hearing.taken_in = int(log.received.sum()), count
+        result.unheard = hearing.problem(summary.get("not_taken_in"))
+        result.skipped["motion"] = "it depends on when in a slot each message reached each process"
+        if self.run.swarm.auth and not own_states.has_key:
+            result.skipped["decisions"] = f"no key in {VARIABLE}"
+        else:
+            result.count("decisions made again", compare_decisions(log, self.run.swarm.auth))
+        result.safety |= delays | {"stalls": summary.get("stalls", [])}
+
+    def _judge(self) -> None:
+        """Whether the frames keep to the rules; those that came too late to be sent were made all the same."""
+        log, judge = self._log, Judge(self.run.swarm)
+        ids = np.arange(1, log.agents + 1)
+        unsent = log.known & (log.chosen == ids) & (log.length == 0)
+        slots: dict[int, dict[int, bytes]] = {}
+        for sent in self.frames.all():
+            slots.setdefault(sent.slot, {})[sent.sender] = sent.data
+        for row in range(len(log)):
+            if row in slots or unsent[row].any():
+                judge.slot(row, slots.get(row, {}), unrecorded=ids[unsent[row]].tolist())
+        self._result.take_judgement(judge)
+
+    def _note_spread(self) -> None:
+        log, spread = self._log, []
+        here = log.known & ~log.sent  # a frame may leave late; the slot starts when it starts
+        for row in np.flatnonzero(here.sum(axis=1) > 1).tolist():
+            spread.append(int(np.ptp(log.offset_ns[row, here[row]])))
+        self._result.safety["clock_spread_max_ms"] = max(spread, default=0) / 1e6
+        self._result.safety["clock_spread_mean_ms"] = float(np.mean(spread)) / 1e6 if spread else 0.0
+
+    def _summary(self) -> dict[str, Any]:
+        found = recorded_summary(self._log, self._result)
+        recorded = found.get("slots", {}).get("total")
+        if recorded is not None and abs(recorded - len(self._log)) > 1:
+            raise Mismatch(Difference("summary.json: slots", str(len(self._log)), str(recorded), "each has a record"))
+        if found:
+            self._result.count("summary.json")
+        return found
+
+
+def compare_decisions(log: FlightArrays, tags: bool) -> int:
+    """Make the decisions of agents with clocks of their own again, and return how many are equal.
+
+    :raises Mismatch: at the first that is not.
+    """
+    equal, why = 0, "follows from what the agent says to have taken in"
+    for row, swarm in replay_log(log, tags):
+        for name in ("chosen", "reason", "digest", "score"):
+            expected, recorded = getattr(swarm, name), getattr(log, name)[row]
+            if expected.tobytes() != recorded.tobytes():
+                difference = first_difference(name, expected[None], recorded[None], row, log)[1].difference
+                raise Mismatch(dataclasses.replace(difference, reason=why))
+        equal += log.agents
+    return equal
+
+
+def check_own_states(log: FlightArrays, own_states: OwnStates) -> None:
+    """Frames say where their senders were, and left when these say.
+
+    :raises Mismatch: at the first that does not.
+    """
+    frames = log.sent_frames
+    for row, sender, data in zip(frames.row.tolist(), frames.sender.tolist(), frames.data, strict=True):
+        if not log.known[row, sender - 1]:
+            continue
+        if log.sent_ns is not None:
+            expected, recorded = (int(values[row, sender - 1]) for values in (log.sent_ns, log.offset_ns))
+            if expected != recorded:
+                why = "a frame starts when its sender's does"
+                raise Mismatch(Difference("offset_ns", f"{expected} ns", f"{recorded} ns", why, row, sender))
+        state = (log.track[row, -1], log.velocity[row], log.command[row])
+        place = row + log.first_slot, sender
+        own_states.check(*place, data, *(vectors[:, sender - 1] for vectors in state))
+
+
+class OwnStates:
+    """Compares frames with the states that their senders reported."""
+
+    def __init__(self, config: SwarmConfig, result: Result) -> None:
+        self._config, self._result = config, result
+        self._authenticator: Authenticator | None = None
+        if config.auth:
+            if key := os.environ.get(VARIABLE, ""):
+                self._authenticator = Authenticator.from_hex(key, config.auth_session)
+            else:
+                result.skipped["tags of frames"] = f"no key in {VARIABLE}"
+
+    @property
+    def has_key(self) -> bool:
+        """Whether the key of sealed frames is at hand."""
+        return self._authenticator is not None
+
+    def check(self, slot: int, agent: int, data: bytes, *state: NDArray[np.float64]) -> None:
+        """One frame: it decodes, names its sender and slot, and says where its sender really was.
+
+        :param state: (3,) each, frame map: position, m, velocity and commanded velocity, m/s, at the slot's start.
+        :raises Mismatch: if it does not.
+        """
+        try:
+            found, right = self._compared(data, slot, agent, *state)
+        except RemoteProtocolError as error:
+            raise Mismatch(
+                Difference("frame", "a frame", str(error), "agents send what others can decode", slot, agent)
+            ) from None
+        for name in ("sender", "slot", "position", "velocity", "intent"):
+            expected, recorded = getattr(right, name), getattr(found, name)
+            if expected != recorded:
+                why = "a frame names its sender and its slot" if name in ("sender", "slot") else (
+                    "the sender's own state, as the codec rounds it")  # fmt: skip
+                raise Mismatch(Difference(f"frame.{name}", str(expected), str(recorded), why, slot, agent))
+        self._result.count("frames equal to their sender's state")
+
+    def _compared(self, data: bytes, slot: int, agent: int, *state: NDArray[np.float64]) -> tuple[Frame, Frame]:
+        """The sender's own state in a frame, and what it should be."""
+        position, velocity, command = (tuple(vector.tolist()) for vector in state)
+        if self._config.auth:
+            data = self._opened(data, slot)
+        data = self._config.protocol_part(data)
+        extent, extended = self._config.extent_m, self._config.extended
+        found: Any = decode_extended(data, extent).own if extended else decode_frame(data, extent)
+        right = Frame(agent, slot & _SLOT_MASK, found.c_r, position, velocity, command if found.intent else None)
+        if extended:
+            return found, decode_extended(encode_extended(ExtendedFrame(right), extent), extent).own
+        return found, decode_frame(encode_frame(right, extent), extent)
+
+    def _opened(self, data: bytes, slot: int) -> bytes:
+        """A sealed frame without its tag, which is checked where the key is at hand."""
+        if self._authenticator is None:
+            return data[:-TAG_LENGTH]
+        opened = self._authenticator.open(data, slot)
+        if opened is None:
+            raise RemoteProtocolError("a tag that the key does not make")
+        self._result.count("tags")
+        return opened

@@ -1,1 +1,0 @@
-"""A recorded run as tables: for the report, for data frames, and as files."""

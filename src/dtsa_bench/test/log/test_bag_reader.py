@@ -1,0 +1,228 @@
+"""Reading back: order, selection, decoding, columns, and bags that are none."""
+
+from __future__ import annotations
+
+import random
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_helpers import RUN, SECOND, SyntheticRun, cdr, definition, header, synthetic_bag, typestore
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.log.bag import metadata
+from dtsa_bench.log.bag.columns import Table
+from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.recover import recover
+from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.runs.config import RunConfig
+
+RECEPTION = "dtsa_msgs/msg/Reception"
+DECISION = "dtsa_msgs/msg/Decision"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
+    return synthetic_bag(tmp_path_factory.mktemp("bags") / "flight", slots=60, chunk_size=20_000)
+
+
+def test_messages_are_exactly_those_recorded_in_order_of_time_and_can_be_chosen(run: SyntheticRun) -> None:
+    with Bag(run.writer.directory) as whole, Bag(run.writer.path) as alone:
+        assert list(whole.messages()) == list(alone.messages())
+        assert whole.config == alone.config == RunConfig(run.config).to_dict()
+    with Bag(run.writer.directory) as bag:
+        found: dict[str, list[tuple[int, int, bytes]]] = {}
+        times = []
+        for message in bag.messages():
+            times.append(message.log_time_ns)
+            assert message.sequence == len(found.setdefault(message.topic, []))
+            found[message.topic].append((message.log_time_ns, message.publish_time_ns, message.data))
+        assert times == sorted(times)
+        assert found == run.written
+        assert (bag.start_ns, bag.end_ns) == (min(times), max(times))
+        assert {name: topic.count for name, topic in bag.topics.items()} == run.writer.counts
+    begin, end = SECOND + 100_000_000, SECOND + 300_000_000
+    with Bag(run.writer.directory) as bag:
+        found = [(m.topic, m.log_time_ns) for m in bag.messages(["/cf1/odom", "/swarm/slot"], begin, end)]
+        expected = [(topic, row[0]) for topic in ("/cf1/odom", "/swarm/slot") for row in run.written[topic]]
+        assert sorted(found) == [entry for entry in expected if begin <= entry[1] <= end]
+        with pytest.raises(UnusableBag, match="no topic '/nothing'"):
+            list(bag.messages(["/nothing"]))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.integers(0, 40), max_size=120), st.integers(1, 30))
+def test_order_holds_whatever_the_order_of_writing(tmp_path_factory, times, per_chunk):
+    directory = tmp_path_factory.mktemp("order") / "bag"
+    kind = RECEPTION
+    with BagWriter(directory, {}) as writer:
+        channels = [writer.add_topic(name, kind, "reliable", definition(kind)) for name in ("/a", "/b")]
+        for number, time in enumerate(times):
+            writer.write(channels[number % 2], number.to_bytes(4, "little"), SECOND + time, SECOND)
+            if number % per_chunk == 0:
+                writer.flush()  # closes the chunk: chunks overlap in time
+    with Bag(directory) as bag:
+        found = [(m.log_time_ns - SECOND, int.from_bytes(m.data, "little")) for m in bag.messages()]
+    assert found == sorted((time, number) for number, time in enumerate(times))
+
+
+def test_damaged_message_bytes_are_an_error_that_names_the_message(run: SyntheticRun) -> None:
+    with Bag(run.writer.directory) as bag:
+        whole = next(bag.messages(["/swarm/decision"]))
+        for size in range(len(whole.data) - 4):
+            with pytest.raises(BagError, match="/swarm/decision at 1"):
+                bag.decode(whole._replace(data=whole.data[:size]))
+        for size in random.Random(3).sample(range(len(whole.data) - 4), 20):
+            table = Table(bag.typestore, whole.type)
+            table.add(SECOND, SECOND, whole.data[:size])
+            with pytest.raises(BagError, match="cannot be decoded"):
+                table.finish()
+        huge = bytearray(whole.data)
+        huge[16:20] = b"\xff\xff\xff\x7f"  # the length of the first sequence
+        with pytest.raises(BagError, match="/swarm/decision"):
+            bag.decode(whole._replace(data=bytes(huge)))
+
+
+def check_columns(columns: dict[str, np.ndarray], typed: list[Any]) -> None:
+    for name, values in columns.items():
+        if not name.endswith("_time_ns"):
+            for value, message in zip(values, typed, strict=True):
+                assert np.array_equal(value, attrgetter(name)(message)), name
+
+
+@pytest.mark.parametrize("topic", ["/swarm/slot", "/swarm/transmission", "/swarm/decision", "/cf2/odom"])
+def test_columns_are_what_decoding_gives(run: SyntheticRun, topic: str) -> None:
+    with Bag(run.writer.directory) as bag:
+        typed = [message for _, message in bag.typed([topic])]
+        columns = bag.columns(topic)
+    assert columns["log_time_ns"].tolist() == [row[0] for row in run.written[topic]]
+    assert columns["publish_time_ns"].tolist() == [row[1] for row in run.written[topic]]
+    check_columns(columns, typed)
+    store = typestore()
+    names = {name.split(".")[0] for name in columns} - {"log_time_ns", "publish_time_ns"}
+    assert names == {name for name, _ in store.fielddefs[type(typed[0]).__msgtype__][1]}
+
+
+DECISIONS = st.lists(
+    st.tuples(
+        st.lists(st.integers(0, 2**16 - 1), max_size=5),
+        st.lists(st.text(max_size=4).filter(lambda text: "\0" not in text), max_size=3),
+        st.lists(st.floats(allow_nan=False), max_size=4),
+        st.lists(st.integers(0, 255), max_size=9),
+    ),
+    max_size=25,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(DECISIONS)
+def test_columns_of_changing_lengths(rows: list[tuple[list[int], list[str], list[float], list[int]]]) -> None:
+    store, typed = typestore(), []
+    table = Table(store, DECISION)
+    for slot, (ids, texts, scores, reasons) in enumerate(rows):
+        data = cdr(
+            DECISION, header=header(SECOND), run=RUN, slot=slot, agent=np.array(ids, np.uint16),
+            chosen=np.array(ids[::-1], np.uint16), reason_name=texts, reason_index=np.array(reasons, np.uint8),
+            reason=np.array([], np.uint8), digest=np.array(reasons, np.uint32), score=np.array(scores),
+        )  # fmt: skip
+        typed.append(store.deserialize_cdr(data, DECISION))
+        table.add(SECOND + slot, SECOND, data)
+    columns = table.finish()
+    assert len(columns["log_time_ns"]) == len(rows)
+    check_columns(columns, typed)
+
+
+def test_columns_may_be_chosen_and_come_for_many_topics_at_once(run: SyntheticRun) -> None:
+    with Bag(run.writer.directory) as bag:
+        found = bag.tables(["/cf1/odom", "/cf3/odom"], ["pose.pose.position.x"])
+        assert found.keys() == {"/cf1/odom", "/cf3/odom"}
+        for topic, columns in found.items():
+            assert list(columns) == ["log_time_ns", "publish_time_ns", "pose.pose.position.x"]
+            assert np.array_equal(columns["pose.pose.position.x"], bag.columns(topic)["pose.pose.position.x"])
+
+
+def test_what_is_no_bag_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.mcap").write_text("hello, I am no bag at all, but long enough to be taken for one")
+    for name in ("nothing.mcap", "old/old_0.db3", "two/two_0.mcap", "two/two_1.mcap", "above/inner/inner_0.mcap"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    for name, text in [
+        ("missing", "no such file"),
+        ("empty", "no .mcap file"),
+        ("text.mcap", "not an MCAP file"),
+        ("nothing.mcap", "not an MCAP file"),
+        ("old", "sqlite3"),
+        ("two", "2 .mcap files"),
+        ("above", "did you mean one of inner"),
+    ]:
+        for use in (Bag, recover):
+            with pytest.raises(UnusableBag, match=text) as caught:
+                use(tmp_path / name)
+            assert "\n" not in str(caught.value)
+            assert str(tmp_path / name) in str(caught.value)
+            assert isinstance(caught.value, ConfigError)
+
+
+def test_bags_unfinished_damaged_or_of_others_are_refused_by_what_they_lack(run: SyntheticRun, tmp_path: Path) -> None:
+    whole = run.writer.path.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UnusableBag, match=r"not closed.*tools/dtsa recover"):
+        Bag(cut)
+    data = bytearray(run.writer.path.read_bytes())
+    with Bag(run.writer.path) as bag:
+        place = bag._chunks[1].chunk_start_offset + 200
+    data[place] ^= 0x10
+    (tmp_path / "bad.mcap").write_bytes(data)
+    with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match=r"damaged chunk.*recover"):
+        list(bag.messages())
+    path = tmp_path / "json.mcap"
+    writer = Writer(str(path))
+    writer.start(profile="")
+    schema = writer.register_schema("Thing", "jsonschema", b"{}")
+    channel = writer.register_channel("/thing", "json", schema)
+    writer.add_message(channel, SECOND, b"{}", SECOND)
+    writer.finish()
+    with pytest.raises(UnusableBag, match=r"/thing is recorded as json/jsonschema"):
+        Bag(path)
+    kind = "nav_msgs/msg/Odometry"
+    with BagWriter(tmp_path / "bag", None) as writer:
+        writer.add_topic("/odom", kind, "reliable", definition(kind))
+    with Bag(tmp_path / "bag") as bag, pytest.raises(UnusableBag, match="no configuration"):
+        _ = bag.config
+
+
+def test_bags_that_rosbag2_has_packed_are_named_as_such(tmp_path: Path) -> None:
+    """As its options `--compression-mode file` and `message` leave them."""
+    whole = tmp_path / "whole" / "whole_0.mcap.zstd"
+    whole.parent.mkdir()
+    whole.write_bytes(b"\x28\xb5\x2f\xfd")
+    single = tmp_path / "single.mcap"
+    with single.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        record = "version: 9\ncompression_format: zstd\ncompression_mode: MESSAGE\ncustom_data: ~\n"
+        writer.add_metadata("rosbag2", {"serialized_metadata": record})
+        channel = writer.register_channel("/x", "cdr", writer.register_schema("std_msgs/msg/Empty", "ros2msg", b""))
+        writer.add_message(channel, SECOND, b"\x28\xb5\x2f\xfd", SECOND)
+        writer.finish()
+    for path in (whole.parent, whole, single):
+        with pytest.raises(UnusableBag, match=r"compressed .*; `ros2 bag convert`"):
+            Bag(path)
+        with pytest.raises(UnusableBag, match=r"compressed .*; `ros2 bag convert`"):
+            recover(path, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_texts_of_the_recorder_stay_texts_without_quotes() -> None:
+    text = 'version: 9\ncustom_data:\n  version: 1.10\n  seed: 007\n  yes: no\n  empty: ""\n'
+    loaded = metadata.load(text)
+    assert loaded["version"] == 9
+    assert metadata.custom_data(loaded) == {"version": "1.10", "seed": "007", "yes": "no", "empty": ""}

@@ -1,0 +1,268 @@
+"""Playing bags: order, time, pausing, and a real subscriber in another process."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bag_helpers import (
+    SECOND,
+    SyntheticRun,
+    as_it_arrives,
+    clock_ns,
+    definition,
+    listen,
+    ros_environment,
+    synthetic_bag,
+    synthetic_run,
+)
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.log.bag import schema
+from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.metadata import PROFILES
+from dtsa_bench.log.bag.reader import Bag, Message
+from dtsa_bench.log.bag.replay import Player, ros_profile
+from dtsa_bench.log.bag.writer import BagWriter
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
+    return synthetic_bag(tmp_path_factory.mktemp("bags") / "flight", slots=100, agents=3, chunk_size=40_000)
+
+
+class Listener:
+    def __init__(self) -> None:
+        self.messages: list[Message] = []
+        self.walls: list[int] = []
+        self.clocks: list[int] = []
+        self.clock_walls: list[int] = []
+
+    def publish(self, message: Message) -> None:
+        self.messages.append(message)
+        self.walls.append(time.monotonic_ns())
+
+    def clock(self, time_ns: int) -> None:
+        self.clocks.append(time_ns)
+        self.clock_walls.append(time.monotonic_ns())
+
+
+def play(run: SyntheticRun, **options: object) -> tuple[Listener, Player]:
+    listener = Listener()
+    with Bag(run.writer.directory) as bag:
+        player = Player(bag, listener, **{"rate": 50.0, **options})  # type: ignore[arg-type]
+        player.play()
+    return listener, player
+
+
+def test_everything_or_what_is_chosen_is_played_in_order_and_the_clock_is_there_before(run: SyntheticRun) -> None:
+    listener, player = play(run)
+    with Bag(run.writer.directory) as bag:
+        assert listener.messages == list(bag.messages())
+    assert player.message_count == len(listener.messages)
+    assert listener.clocks == sorted(listener.clocks)
+    assert listener.clocks[0] == listener.messages[0].log_time_ns
+    assert {message.log_time_ns for message in listener.messages} <= set(listener.clocks)
+    listener, _ = play(run, topics=["/cf1/odom", "/swarm/slot"])
+    assert {message.topic for message in listener.messages} == {"/cf1/odom", "/swarm/slot"}
+    listener, _ = play(run, start_s=0.5)
+    assert min(message.log_time_ns for message in listener.messages) == SECOND + SECOND // 2
+    listener = Listener()
+    with Bag(run.writer.directory) as bag:
+        player = Player(bag, listener, rate=100.0, loop=True, topics=["/swarm/slot"])
+        player.play(lambda playing: setattr(playing, "stopped", playing.round_count >= 2))
+    slots = [message.log_time_ns for message in listener.messages]
+    assert slots[:200] == 2 * [SECOND + k * 10_000_000 for k in range(100)]
+
+
+@pytest.mark.parametrize(("rate", "gap_slots"), [(0.5, 30), (8.0, 800)])
+def test_between_messages_the_clock_goes_on_at_the_rate(tmp_path: Path, rate: float, gap_slots: int) -> None:
+    run = synthetic_run(tmp_path / "bag", agents=2)
+    with run.writer:
+        run.slot(0)
+        run.slot(gap_slots)
+    began = time.monotonic_ns()
+    listener, _ = play(run, rate=rate)
+    first, last = listener.messages[0].log_time_ns, listener.messages[-1].log_time_ns
+    between = set(listener.clocks) - {message.log_time_ns for message in listener.messages}
+    assert len(between) >= 5
+    assert listener.clocks == sorted(listener.clocks)  # a clock too fast would be ahead of the next message
+    for clock, wall in zip(listener.clocks, listener.clock_walls, strict=True):
+        assert clock - first <= (wall - began) * rate
+    assert max(between) - first > (last - first) * 0.3  # one too slow would reach an eighth of the way
+
+
+@pytest.mark.alone
+@pytest.mark.realtime
+@pytest.mark.parametrize("rate", [1.0, 4.0])
+def test_messages_keep_their_time(run: SyntheticRun, rate: float) -> None:
+    listener, _ = play(run, rate=rate, topics=["/swarm/slot"])
+    offsets = [
+        (wall - listener.walls[0]) - (message.log_time_ns - SECOND) / rate
+        for wall, message in zip(listener.walls, listener.messages, strict=True)
+    ]
+    assert statistics.median(abs(offset - statistics.median(offsets)) for offset in offsets) < 1_000_000
+
+
+def test_a_pause_stops_messages_and_the_rest_keeps_its_distance(run: SyntheticRun) -> None:
+    listener = Listener()
+    paused: list[int] = []
+
+    def poll(player: Player) -> None:
+        begins = not paused and player.message_count > 200
+        ends = player.paused and time.monotonic_ns() > paused[0] + 300_000_000
+        if begins or ends:
+            paused.append(time.monotonic_ns())
+            player.paused = not player.paused
+
+    with Bag(run.writer.directory) as bag:
+        Player(bag, listener, rate=1.0).play(poll)
+    assert len(paused) == 2
+    assert not [wall for wall in listener.walls if paused[0] < wall < paused[1]]
+    with Bag(run.writer.directory) as bag:
+        assert listener.messages == list(bag.messages())
+    length = listener.walls[-1] - listener.walls[0] - (paused[1] - paused[0])
+    recorded = listener.messages[-1].log_time_ns - listener.messages[0].log_time_ns
+    assert length >= recorded - 1_000_000
+    assert listener.clocks == sorted(listener.clocks)
+
+
+def test_impossible_rates_starts_and_topics_are_refused(run: SyntheticRun) -> None:
+    for rate in (0.0, -1.0, float("nan"), 1e9):
+        with pytest.raises(ConfigError, match="rate"):
+            play(run, rate=rate)
+    for start in (-0.1, 1.5, float("nan")):
+        with pytest.raises(ConfigError, match="start"):
+            play(run, start_s=start)
+    with pytest.raises(UnusableBag, match="no topic"):
+        play(run, topics=["/swarm/nothing"])
+
+
+def test_a_damaged_chunk_ends_the_playing_with_an_error(run: SyntheticRun, tmp_path: Path) -> None:
+    data = bytearray(run.writer.path.read_bytes())
+    with Bag(run.writer.path) as bag:
+        data[bag._chunks[-1].chunk_start_offset + 100] ^= 1
+    (tmp_path / "bad.mcap").write_bytes(data)
+    with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match="recover"):
+        Player(bag, Listener(), rate=100.0).play()
+
+
+def need_ros() -> None:
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    pytest.importorskip("dtsa_msgs", reason="the workspace is not built")
+    try:
+        schema.installed("dtsa_msgs/msg/Slot")
+    except BagError as error:
+        pytest.skip(str(error))
+
+
+def start_replay(*words: str | Path, **options: Any) -> subprocess.Popen[str]:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": ros_environment(), **options}
+    return subprocess.Popen([sys.executable, "-m", "dtsa_bench", "replay", *map(str, words)], text=True, **pipes)
+
+
+@pytest.mark.ros
+@pytest.mark.alone
+@pytest.mark.realtime
+def test_another_process_hears_the_recorded_bytes_in_time(run: SyntheticRun, tmp_path: Path) -> None:
+    need_ros()
+    from node_helpers import ros_graph
+
+    with ros_graph(tmp_path) as graph:
+        arrived = listen(graph, run.writer.directory)
+        words = ("--wait-for-subscriber", "--delay", "1.5")
+        player = start_replay(run.writer.directory, *words, env=graph.environment)
+        graph.until(lambda: player.poll() is not None and len(arrived["/swarm/slot"]) >= 100)
+        out, error = player.communicate()
+    assert player.returncode == 0, error
+    assert f"played {run.writer.message_count} messages" in out
+    assert [data for _, data in arrived["/swarm/slot"]] == [as_it_arrives(row[2]) for row in run.written["/swarm/slot"]]
+    odometry = {data for _, data in arrived["/cf2/odom"]}
+    assert odometry <= {as_it_arrives(row[2]) for row in run.written["/cf2/odom"]}
+    assert len(odometry) >= 90  # best effort, as recorded
+    clock = [clock_ns(data) for _, data in arrived["/clock"]]
+    assert clock == sorted(clock)
+    assert clock[0] >= SECOND
+    offsets = [wall - 10_000_000 * k for k, (wall, _) in enumerate(arrived["/swarm/slot"])]
+    middle = statistics.median(offsets)
+    assert statistics.median(abs(offset - middle) for offset in offsets) < 1_000_000
+
+
+@pytest.mark.ros
+def test_space_pauses_and_q_ends_in_a_terminal(run: SyntheticRun) -> None:
+    need_ros()
+    control, terminal = pty.openpty()
+    player = start_replay(run.writer.directory, "--loop", "--delay", "0", stdin=terminal, stderr=terminal)
+    seen = ""
+
+    def read_until(text: str) -> None:
+        nonlocal seen
+        end = time.monotonic() + 30
+        while text not in seen and time.monotonic() < end:
+            seen += os.read(control, 4096).decode("utf-8", "replace")
+        assert text in seen
+        seen = ""
+
+    try:
+        os.close(terminal)
+        for text, key in ((" messages ", b" "), ("paused", b" "), ("messages         ", b"q")):
+            read_until(text)
+            os.write(control, key)
+        assert "played" in player.communicate(timeout=30)[0]
+        assert player.returncode == 0
+    finally:
+        player.kill()
+        player.communicate()
+        os.close(control)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_a_player_cleanly(run: SyntheticRun, number: signal.Signals) -> None:
+    need_ros()
+    player = start_replay(run.writer.directory, "--loop")
+    assert player.stdout.readline().startswith("playing ")
+    player.send_signal(number)
+    out, error = player.communicate(timeout=30)
+    assert player.returncode == 0, error
+    assert "played" in out
+    assert "Traceback" not in error
+
+
+def test_recorded_qos_becomes_that_of_the_publisher() -> None:
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+    latched = ros_profile([PROFILES["latched"]])
+    assert (latched.reliability, latched.durability) == (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+    assert latched.depth == 1
+    sensor = ros_profile([PROFILES["sensor_data"]])
+    assert (sensor.reliability, sensor.depth) == (ReliabilityPolicy.BEST_EFFORT, 5)
+    mixed = ros_profile([PROFILES["reliable"], PROFILES["best_effort"]])
+    assert mixed.reliability == ReliabilityPolicy.BEST_EFFORT
+    depths = [
+        ros_profile([PROFILES["reliable"] | {"depth": depth} for depth in pair]).depth for pair in ((3, 7), (7, 3))
+    ]
+    assert depths == [7, 7]
+
+
+@pytest.mark.ros
+def test_a_type_that_has_changed_since_is_refused(tmp_path: Path) -> None:
+    need_ros()
+    kind = "nav_msgs/msg/Odometry"
+    other = schema.Definition(kind, definition(kind).text, "RIHS01_" + 64 * "0")
+    with BagWriter(tmp_path / "bag", {}) as writer:
+        writer.add_topic("/odom", kind, "reliable", other)
+    player = start_replay(tmp_path / "bag")
+    error = player.communicate()[1]
+    assert player.returncode == 1
+    assert "differs from the installed one" in error
+    assert "Traceback" not in error
