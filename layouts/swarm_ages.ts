@@ -7,9 +7,8 @@ type Output = {
   age_max: number;
   ages: number[]; // by id - 1; NaN while unknown because the script did not see the flight's start
 };
-type InputEvent = Input<"/swarm/decision"> | Input<"/swarm/reception">;
 
-export const inputs = ["/swarm/decision", "/swarm/reception"];
+export const inputs = ["/swarm/slot_record"];
 export const output = "/studio_script/swarm_ages";
 
 let ids: number[] = [];
@@ -19,12 +18,9 @@ let latest = -1;
 let result: Output = { slot: 0, age_mean: NaN, age_max: NaN, ages: [] };
 
 // Every message gives an output: players warn of scripts that return nothing.
-export default function script(event: InputEvent): Output {
+export default function script(event: Input<"/swarm/slot_record">): Output {
   const message = event.message as any;
-  if (event.topic === "/swarm/decision") {
-    ids = Array.from(message.agent as number[]);
-    return result;
-  }
+  ids = Array.from(message.agent as number[]);
   if (message.slot < latest) {
     // The player went back: what was heard later is not known yet.
     heard = {};

@@ -2,32 +2,26 @@
 import { Input } from "./types";
 
 type Output = {
-  slot: number; // the last slot that all agents have answered
+  slot: number; // that all agents have answered
   distance_min: number; // m, of the closest pair at its start
   distance_a: number; // their ids
   distance_b: number;
 };
 
-export const inputs = ["/swarm/transmission"];
+export const inputs = ["/swarm/slot_record"];
 export const output = "/studio_script/swarm_distances";
 
 const place: { [id: number]: number[] } = {};
-let latest = -1;
-let result: Output = { slot: 0, distance_min: NaN, distance_a: 0, distance_b: 0 };
 
 // Every message gives an output: players warn of scripts that return nothing.
-export default function script(event: Input<"/swarm/transmission">): Output {
+export default function script(event: Input<"/swarm/slot_record">): Output {
   const message = event.message as any;
-  if (message.slot !== latest) {
-    result = closest(latest);
-    latest = message.slot;
-  }
   const count = message.agent.length;
   const last = (message.steps - 1) * 3 * count;
   for (let k = 0; k < count; k++) {
     place[message.agent[k]] = [0, 1, 2].map((axis) => message.track[last + axis * count + k]);
   }
-  return result;
+  return closest(message.slot);
 }
 
 function closest(slot: number): Output {

@@ -16,9 +16,8 @@ from typing import Any
 
 from waiting import wait_for
 
-from dtsa_agent.ros.common.wire.packing import split_frames
-from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
+from dtsa_bench.log.record import load_log
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.log.verify.result import Result
 
@@ -42,12 +41,8 @@ def fly(out: Path, *words: str) -> dict[str, Any]:
 
 def frames(out: Path) -> list[tuple[int, int, bytes]]:
     """(slot, sender, frame) of all frames that the nodes of a flight sent, in order."""
-    sent = []
-    with Bag(out / "bag") as bag:
-        for _, message in bag.typed(["/swarm/transmission"]):
-            pieces = split_frames(message.data, message.length)
-            sent += [(int(message.slot), int(a), f) for a, f in zip(message.agent, pieces, strict=True) if f]
-    return sorted(sent)
+    sent = load_log(out).sent_frames
+    return list(zip(sent.row.tolist(), sent.sender.tolist(), sent.data, strict=True))
 
 
 def readable(out: Path) -> int:

@@ -18,6 +18,7 @@ from bag_helpers import flight_bag
 
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
 from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.record import SLOT_RECORD
 from dtsa_bench.pages.view.follower import Follower
 from dtsa_bench.pages.view.track import Track
 
@@ -37,16 +38,13 @@ def track_of(bag: Path) -> Track:
     follower = Follower(track, {})
     with Bag(bag) as opened:
         follower.begin(opened.config)
-        sent: dict[int, Any] = {}
-        for _, message in opened.typed(["/swarm/transmission", "/swarm/reception"]):
-            if hasattr(message, "track"):
-                sent[message.slot] = message
+        for _, record in opened.typed([SLOT_RECORD]):
+            if not len(record.chosen):  # where all are at the end
                 continue
-            answer = sent.pop(message.slot)
-            follower.receive("Decision", answer)
-            follower.receive("MarkerArray", markers_of(answer))
-            follower.receive("Slot", delivery_of(answer, message))
-            follower.receive("Reception", message)
+            follower.receive("Decision", record)
+            follower.receive("MarkerArray", markers_of(record))
+            follower.receive("Slot", delivery_of(record))
+            follower.receive("Reception", record)
     follower.finish("recorded")
     assert not follower.unusable
     return track
@@ -63,14 +61,16 @@ def markers_of(answer: Any) -> SimpleNamespace:
     return SimpleNamespace(markers=spheres)
 
 
-def delivery_of(answer: Any, reception: Any) -> SimpleNamespace:
-    """The frames of a transmission that at least one agent received, as the channel delivers them."""
-    frames = dict(zip(answer.agent.tolist(), split_frames(bytes(answer.data), answer.length.tolist()), strict=True))
-    mask = unpack_received(bytes(reception.received), len(reception.sender), len(answer.agent))
-    senders = [sender for sender, row in zip(reception.sender.tolist(), mask, strict=True) if row.any()]
-    data = np.frombuffer(b"".join(frames[sender] for sender in senders), np.uint8)
-    lengths = [len(frames[sender]) for sender in senders]
-    return SimpleNamespace(phase=0, heard_slot=answer.slot, sender=senders, length=lengths, data=data)
+def delivery_of(record: Any) -> SimpleNamespace:
+    """The frames of a slot that at least one agent received, as the channel delivers them."""
+    frames = split_frames(bytes(record.data), record.length.tolist())
+    mask = unpack_received(bytes(record.received), len(frames), len(record.agent)).any(axis=1)
+    kept = np.flatnonzero(mask).tolist()
+    data = np.frombuffer(b"".join(frames[row] for row in kept), np.uint8)
+    lengths = [len(frames[row]) for row in kept]
+    return SimpleNamespace(
+        phase=0, heard_slot=record.slot, sender=record.sender[kept].tolist(), length=lengths, data=data
+    )
 
 
 def numbers(text: str, kind: str) -> np.ndarray:

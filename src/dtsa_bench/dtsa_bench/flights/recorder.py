@@ -64,7 +64,6 @@ class FlightRecorder(ChannelObserver):
         self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
         self._packer = OdometryPacker([f"{space[1:]}/base_link" for space in spaces], names.FRAME)
         self._accounts = None if run.mode == LOCKSTEP else RealtimeAccounts(agents, self._steps, self._slot_ns)
-        self._ids = np.arange(1, agents + 1, dtype=np.uint16)
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1
         self._complete = -1  # last slot that all have answered,
@@ -135,23 +134,13 @@ class FlightRecorder(ChannelObserver):
         at = self._time_ns(slot)
         self._pending_slot = slot
         if self._accounts is None:
-            self._pending.append((self._record, self._lockstep_record(slot, answers, verdict), at))
+            self._pending.append((self._record, self._packed.record(slot, answers, verdict), at))
         else:
             self._accounts.judge(verdict)
         if slot % self._view_slots == 0:
             motion = self._packer.pack(at, answers.position, answers.velocity)
             self._pending += [(channel, data, at) for channel, data in zip(self._odometry, motion, strict=True)]
             self._pending.append((self._markers, self._packed.markers(slot, answers, verdict), at))
-
-    def _lockstep_record(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
-        frames = {sender: answers.frames[sender] for sender in verdict.senders}
-        nothing = [0] * len(frames)
-        received = verdict.mask(len(self._ids)) if frames else None
-        account = {name: getattr(answers, name) for name in (*_DECIDED, "track", *_VECTORS)}
-        return pack_record(
-            self._run_id, slot, self._time_ns(slot), self._steps, verdict.outcome, agent=self._ids, **account,
-            **frame_fields(frames, received), lost=verdict.lost or nothing, collided=verdict.collided or nothing,
-        )  # fmt: skip
 
     def settings_changed(self, change: Change) -> None:
         if not self._event:  # the topic is in the bags of such flights only

@@ -6,7 +6,7 @@ from array import array
 from functools import lru_cache
 
 import numpy as np
-from dtsa_msgs.msg import Decision, Reception
+from dtsa_msgs.msg import Decision, Reception, SlotRecord
 from numpy.typing import NDArray
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
@@ -16,10 +16,12 @@ from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.cdr import Message
 from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_bench.log.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPacker
+from dtsa_bench.log.record import frame_fields, pack_record
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 
+_ACCOUNT = ("chosen", "reason", "digest", "score", "track", "velocity", "command", "goal")
 _KNOWN = 256  # combinations of reasons whose texts are kept
 _RECEPTION = Message({
     "run": "I", "slot": "I", "outcome": "B", "sender": "*H", "received": "*B", "lost": "*H", "collided": "*H",
@@ -70,6 +72,23 @@ class SlotMessages:
         texts = [(REASONS[code] if code < len(REASONS) else str(code)).encode() + b"\0" for code in used]
         return texts, np.searchsorted(used, reason).astype(np.uint8).tobytes()
 
+    def record(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
+        """A dtsa_msgs/SlotRecord as CDR, without what agents with clocks of their own took in."""
+        frames = {sender: data for sender in sorted(verdict.senders) if (data := answers.frames.get(sender))}
+        order = [verdict.senders.index(sender) for sender in frames]
+        lost, collided = (
+            [0] * len(order) if values is None else [values[row] for row in order]
+            for values in (verdict.lost, verdict.collided)
+        )
+        here = slice(None) if answers.answered.all() else np.flatnonzero(answers.answered)
+        account = {name: getattr(answers, name)[..., here] for name in _ACCOUNT}
+        return pack_record(
+            self._run_id, slot, names.slot_time_ns(slot, self._slot_ns), answers.steps, verdict.outcome,
+            agent=np.arange(1, self._agents + 1)[here], **account,
+            **frame_fields(frames, verdict.mask(self._agents)[order] if frames else None), lost=lost,
+            collided=collided,
+        )  # fmt: skip
+
     def reception(self, slot: int, verdict: Verdict) -> bytes:
         """A dtsa_msgs/Reception as CDR.
 
@@ -108,21 +127,24 @@ class LiveTopics(ChannelObserver):
 
     def __init__(self, node: Node, scenario: Scenario, slot_ns: int, run_id: int, space: str = names.SWARM) -> None:
         self._messages = SlotMessages(scenario, slot_ns, run_id)
-        self._decision, self._reception, self._markers = self._publishers = tuple(
-            node.create_publisher(kind, f"{space}/{topic}", 10)
-            for kind, topic in ((Decision, names.DECISION), (Reception, names.RECEPTION), (MarkerArray, names.MARKERS))
-        )
-        self._watched = [False, False, False]
+        topics = {names.DECISION: Decision, names.RECEPTION: Reception, "slot_record": SlotRecord}
+        topics[names.MARKERS] = MarkerArray
+        self._publishers = [node.create_publisher(kind, f"{space}/{topic}", 10) for topic, kind in topics.items()]
+        self._watched = [False] * len(topics)
         self._marker_slots = max(1, round(_MARKER_PERIOD_NS / slot_ns))
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
-        decision, reception, markers = self._watched
-        if decision:
-            self._decision.publish(self._messages.decision(slot, answers))
-        if reception:
-            self._reception.publish(self._messages.reception(slot, verdict))
-        if markers and slot % self._marker_slots == 0:
-            self._markers.publish(self._messages.markers(slot, answers, verdict))
+        packed = self._messages
+        makers = (
+            lambda: packed.decision(slot, answers),
+            lambda: packed.reception(slot, verdict),
+            lambda: packed.record(slot, answers, verdict),
+            lambda: packed.markers(slot, answers, verdict),
+        )
+        shown = [*self._watched[:3], self._watched[3] and slot % self._marker_slots == 0]
+        for publisher, is_shown, pack in zip(self._publishers, shown, makers, strict=True):
+            if is_shown:
+                publisher.publish(pack())
 
     def idle(self, status: ChannelStatus) -> None:
         self._watched = [publisher.get_subscription_count() > 0 for publisher in self._publishers]

@@ -1,7 +1,7 @@
 """The bag that an agent on a network makes of its own flight: a file of slot records, written and read. Needs no ROS.
 
-Times are those of the agent's own clock, moved so that its first is one second; a record holds the frames that the agent
-heard. A file that was not finished is read as far as it is whole.
+Times are those of the agent's own clock, moved so that its first is one second. Frames are whole datagrams here, those
+of others that it heard among them. A file that was not finished is read as far as it is whole.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_bench import __version__
@@ -177,21 +178,21 @@ class AgentRecorder:
 
     def _pack(self, record: SlotRecord) -> bytes:
         heard, zero_ns = [*record.before, *record.heard], record.start_ns
-        frame = frame_in(record.datagram, self._config) if record.datagram else b""
-        frames = [frame_in(one.datagram, self._config) for one in heard]
-        is_sent = bool(frame)
+        is_sent = bool(record.datagram)
+        sent = {self._id: record.datagram} if is_sent else {}
         return pack_record(
             self._config.auth_session or 1, record.slot, zero_ns - self._zero_ns + names.TIME_ZERO_NS,
             len(record.track), agent=[self._id], presence=[record.present | (NEW if record.anew else 0)],
             chosen=[record.chosen], reason=[record.reason], digest=[record.digest], score=[record.score],
             offset_ns=[record.sent_ns - zero_ns if is_sent else 0], track=record.track, velocity=record.velocity,
-            command=record.command, goal=record.goal, **frame_fields({self._id: frame} if is_sent else {}, None),
+            command=record.command, goal=record.goal, **frame_fields(sent, None),
             sent_ns=[record.sent_ns - zero_ns] * is_sent, lost=[0] * is_sent, collided=[0] * is_sent,
             heard_sender=[one.sender for one in heard], heard_slot=[one.slot for one in heard],
             heard_ns=[one.arrival_ns - zero_ns for one in heard],
             heard_by=np.frombuffer(pack_received(self._by) * len(heard), np.uint8),
             heard_before=[1] * len(record.before) + [0] * len(record.heard) if record.before else [],
-            heard_length=[len(data) for data in frames], heard_data=np.frombuffer(b"".join(frames), np.uint8),
+            heard_length=[len(one.datagram) for one in heard],
+            heard_data=np.frombuffer(b"".join(one.datagram for one in heard), np.uint8),
         )  # fmt: skip
 
     def finish(self, summary: dict[str, Any]) -> None:
@@ -349,11 +350,13 @@ def _add_slot(bag: AgentBag, said: Any) -> None:
     is_before = said.heard_before.tolist() or [0] * len(frames)
     columns = zip(said.heard_sender.tolist(), said.heard_slot.tolist(), said.heard_ns.tolist(), frames, strict=True)
     heard = [Heard(sender, slot, start_ns + at_ns, data, True) for sender, slot, at_ns, data in columns]
+    datagram = said.data.tobytes() if is_sent else b""
+    frame = frame_in(datagram, bag.swarm)
     record = SlotRecord(
         int(said.slot), start_ns, start_ns, bool(presence & NEW), presence & ~NEW, int(said.chosen[0]),
         int(said.reason[0]), int(said.digest[0]), float(said.score[0]), said.track.reshape(-1, 3), said.velocity,
-        said.command, said.goal, sent_ns=start_ns + int(said.sent_ns[0]) if is_sent else -1,
-        datagram=said.data.tobytes() if is_sent else b"",
+        said.command, said.goal, frame=frame[: len(frame) - (TAG_LENGTH if bag.swarm.auth else 0)],
+        sent_ns=start_ns + int(said.sent_ns[0]) if is_sent else -1, datagram=datagram,
         before=[one for one, early in zip(heard, is_before, strict=True) if early],
         heard=[one for one, early in zip(heard, is_before, strict=True) if not early],
     )  # fmt: skip

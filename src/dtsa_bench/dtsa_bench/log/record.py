@@ -298,6 +298,7 @@ class _Rows:
         """The log."""
         arrays, keys = self._arrays, sorted(self._frames)
         received = np.array([self._received[key] for key in keys], np.bool_).reshape(len(keys), self.agents)
+        self._own_clocks = self._own_clocks or settings.get("mode") == names.MODES[1]
         heard = self._heard_frames() if self._own_clocks else None
         presence, sent_ns = arrays.pop("presence"), arrays.pop("sent_ns")
         return FlightLog(

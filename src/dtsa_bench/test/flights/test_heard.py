@@ -101,13 +101,13 @@ def check_heard(out: Path, summary: dict[str, Any], own_bytes: int, sealed: bool
     with Bag(out) as bag:
         run = load_log(bag)
     heard = np.zeros((AGENTS, AGENTS), dtype=bool)
-    for sender, received in zip(run.frames.sender, run.frames.received, strict=True):
+    for sender, received in zip(run.sent_frames.sender, run.received, strict=True):
         heard[sender - 1] |= received
     assert (heard | np.eye(AGENTS, dtype=bool)).all()
     appended = own_bytes + (TAG_LENGTH if sealed else 0)
-    lengths = {len(data) for data in run.frames.data}
+    lengths = {len(data) for data in run.sent_frames.data}
     assert lengths <= {length + appended for length in LENGTHS.values()}, lengths
-    (frames,) = (one for one in export(out, out / "tables", "csv", ["frames"]) if one.path.stem == "frames")
+    (frames,) = (one for one in export(run, out / "tables", "csv", ["frames"]) if one.path.stem == "frames")
     said = [row["position_x_m"] for row in csv.DictReader(frames.path.read_text().splitlines())]
     assert said
     assert all(said)  # what was said can be read, whatever stands behind it
@@ -148,7 +148,7 @@ def test_agents_on_a_network_hear_each_other(tmp_path: Path, kind: str) -> None:
     assert merged.returncode == 0, merged.stderr
     verified(tmp_path / "whole")
     with Bag(tmp_path / "whole") as bag:
-        lengths = {len(data) for data in load_log(bag).frames.data if data}
+        lengths = {len(data) for data in load_log(bag).sent_frames.data if data}
     tag = TAG_LENGTH if "--auth" in words else 0
     assert lengths <= {length + own_bytes + tag for length in LENGTHS.values()}, lengths
 

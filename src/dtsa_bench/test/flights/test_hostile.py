@@ -30,7 +30,7 @@ from dtsa_agent.core.frame import ExtendedFrame, encode_extended
 from dtsa_agent.core.settings.config import agreed_settings, settings_hash
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.stamps import header_of
-from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.record import load_log
 from dtsa_bench.log.verify.check import verify_bag
 
 pytestmark = pytest.mark.ros
@@ -183,9 +183,8 @@ def test_messages_of_every_kind_end_and_freeze_nobody_in_real_time_and_are_not_b
     assert summary["lost_agents"] == []
     assert sum(summary["not_taken_in"].values()) > len(forged) + 60
     assert summary["not_taken_in"]["other sender"] >= len(forged)
-    with Bag(tmp_path / "out" / "bag") as bag:
-        sent = {bytes(record.data) for record in bag.messages() if record.topic == "/swarm/frame"}
-    assert not [data for data in forged if any(data in message for message in sent)]
+    sent = load_log(tmp_path / "out").sent_frames.data
+    assert not [data for data in forged if any(data in frame for frame in sent)]
 
 
 @pytest.mark.parametrize(("second", "said"), [
@@ -290,8 +289,7 @@ def test_each_flight_has_a_session_of_its_own(tmp_path: Path, monkeypatch: pytes
     for name in ("one", "two"):
         fly(tmp_path / name, *SHAPE, "--auth", "--timeout-s", "0.3")
         sent.append(frames(tmp_path / name))
-        with Bag(tmp_path / name / "bag") as bag:
-            sessions.append(bag.config["swarm"]["auth_session"])
+        sessions.append(load_log(tmp_path / name).settings["swarm"]["auth_session"])
         assert verify_bag(tmp_path / name).ok
     assert len(set(sessions)) == 2
     assert all(sessions)

@@ -17,7 +17,7 @@ from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import decode_extended
 from dtsa_agent.core.reference.lease.memory import Memory
 from dtsa_agent.core.reference.rules import Rules
-from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.record import load_log
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_bench.runs.metrics import COMPLETED, CRASHED, FlightMetrics
 from dtsa_channel_sim.model.verdict import SUCCESS
@@ -55,22 +55,17 @@ class Report:
 
 
 def reports(out: Path, agent: int) -> list[Report]:
-    found: list[Report] = []
-    heard = {}
-    with Bag(out / "bag") as bag:
-        for _, message in bag.typed(["/swarm/transmission", "/swarm/slot"]):
-            if hasattr(message, "heard_slot"):
-                if agent in message.sender.tolist():
-                    heard[int(message.heard_slot)] = int(np.unpackbits(message.received).sum())
-            elif agent in message.agent.tolist():
-                k, count = message.agent.tolist().index(agent), len(message.agent)
-                before, length = int(message.length[:k].sum()), int(message.length[k])
-                place = message.track.reshape(message.steps, 3, count)[-1, :, k]
-                data = message.data[before : before + length].tobytes()
-                found.append(Report(int(message.slot), int(message.chosen[k]), REASONS[message.reason[k]], place, data))
-    for report in found:
-        report.heard = heard.get(report.slot, 0) if report.frame else 0
-    return found
+    log, column = load_log(out), agent - 1
+    heard = {
+        int(row): int(mask.sum()) for row, sender, _, mask, *_ in zip(*log.sent_frames, strict=True) if sender == agent
+    }
+    return [
+        Report(
+            row, int(log.chosen[row, column]), REASONS[log.reason[row, column]], log.track[row, -1, :, column],
+            log.frame(row, agent), heard.get(row, 0),
+        )
+        for row in np.flatnonzero(log.known[:, column]).tolist()
+    ]  # fmt: skip
 
 
 def before_and_after(out: Path, agent: int) -> tuple[list[Report], list[Report]]:

@@ -22,9 +22,7 @@ from dtsa_agent.ros.common.graph import names
 SHARE = Path(__file__).resolve().parents[2]
 LAYOUTS = Path(__file__).resolve().parents[4] / "layouts"
 TYPES = {
-    "/swarm/slot": "dtsa_msgs/msg/Slot", "/swarm/transmission": "dtsa_msgs/msg/Transmission",
-    "/swarm/reception": "dtsa_msgs/msg/Reception", "/swarm/decision": "dtsa_msgs/msg/Decision",
-    "/swarm/markers": "visualization_msgs/msg/MarkerArray",
+    "/swarm/slot_record": "dtsa_msgs/msg/SlotRecord", "/swarm/markers": "visualization_msgs/msg/MarkerArray",
     **{f"/cf{k}/odom": "nav_msgs/msg/Odometry" for k in range(1, 13)},
 }  # fmt: skip
 
@@ -149,14 +147,14 @@ def test_every_plotjuggler_curve_exists(make: ModuleType) -> None:
         assert {source.tag for source in sources} == used
         assert len(used) <= 8  # more are too many for PlotJuggler 3.9
         if "age of" in snippet.get("name", ""):
-            assert snippet.findtext("linked_source") == "/swarm/reception/outcome"
-            assert sources[0].text == "/swarm/reception/sender[0]"
+            assert snippet.findtext("linked_source") == "/swarm/slot_record/outcome"
+            assert sources[0].text == "/swarm/slot_record/sender[0]"
 
 
 def test_no_topic_has_numbers_that_plotjuggler_refuses() -> None:
     """It loads nothing of a bag with a number that a double cannot hold, such as a digest of 64 bits."""
     assert [topic for topic, kind in TYPES.items() if "uint64" in numbers(kind)] == []
-    assert "int64" in numbers(TYPES["/swarm/transmission"])  # the check sees them; nanoseconds within a slot are small
+    assert "int64" in numbers(TYPES["/swarm/slot_record"])  # the check sees them; nanoseconds within a slot are small
 
 
 def test_other_numbers_of_agents_and_nonsense(make: ModuleType) -> None:

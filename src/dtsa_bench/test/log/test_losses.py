@@ -90,11 +90,11 @@ def test_links_without_data_lose_as_all_do_and_of_merged_flights_what_was_told_c
         fit_links([(slots[:0], senders[:0], outcome[:0])], 4)
     received = np.array([[False, True, False], [True, False, True], [True, True, False], [False, True, False]])
     frames = SimpleNamespace(
-        slot=np.array([0, 1, 1, 2]), sender=np.array([1, 2, 3, 1]), received=received,
+        row=np.array([0, 1, 1, 2]), sender=np.array([1, 2, 3, 1]), received=received,
         lost=np.zeros(4, int), collided=np.zeros(4, int),
     )  # fmt: skip
     told = np.array([[True, True, True], [True, True, True], [True, True, False]])
-    run, left_out = SimpleNamespace(frames=frames, agents=3, slots=np.arange(3), told=told), Counter()
+    run, left_out = SimpleNamespace(sent_frames=frames, agents=3, known=told, merged={}), Counter()
     slots, senders, outcome = observe(run, "flight", left_out)
     assert (slots.tolist(), senders.tolist()) == ([0, 2], [1, 1])
     assert outcome.tolist() == [[UNKNOWN, HEARD, LOST], [UNKNOWN, HEARD, UNKNOWN]]
@@ -117,8 +117,8 @@ def test_a_flight_in_lockstep_is_learnt_and_flown_and_verified_without_the_file(
     said = capsys.readouterr().out
     assert "5 agents, 20 links, slots of 10 ms: 820 frames, 3280 receptions, 24.1 % lost\nbursts: " in said
     learnt, run = json.loads(model.read_text()), load_log(flight)
-    assert np.sum(learnt["sent"]) == 4 * len(run.frames.slot)
-    assert np.sum(learnt["sent"]) - np.sum(learnt["lost"]) == run.frames.received.sum()
+    assert np.sum(learnt["sent"]) == 4 * len(run.sent_frames.row)
+    assert np.sum(learnt["sent"]) - np.sum(learnt["lost"]) == run.received.sum()
     assert learnt["memory_slots"] == pytest.approx(15 * 0.75, rel=0.4)
     # In the channel that was learnt: nodes and simulator alike, and the bag needs no file.
     flown_again = fly(tmp_path / "again", "--policy", "lease", "--losses", str(model))
@@ -132,7 +132,7 @@ def test_a_flight_in_lockstep_is_learnt_and_flown_and_verified_without_the_file(
     assert {key: simulated[key] for key in same} == {key: summary[key] for key in same}
     model.unlink()
     assert verify_bag(flown_again).ok
-    assert load_log(flown_again).config["channel"]["losses"]["name"] == "losses.json"
+    assert load_log(flown_again).settings["channel"]["losses"]["name"] == "losses.json"
 
 
 @pytest.mark.ros
@@ -140,11 +140,11 @@ def test_what_is_out_of_reach_or_collides_is_no_loss(tmp_path):
     flight = fly(tmp_path / "flown", "--policy", "aloha", "--loss", "0.2", "--range-m", "2.5")
     run, left_out = load_log(flight), Counter()
     _, _, outcome = observe(run, flight, left_out)
-    assert left_out["collided somewhere"] == np.count_nonzero(run.frames.collided)
+    assert left_out["collided somewhere"] == np.count_nonzero(run.sent_frames.collided)
     assert not left_out["not known who was in reach"]
-    alone = run.frames.collided == 0
-    assert np.count_nonzero(outcome == LOST) == run.frames.lost[alone].sum()
-    assert np.count_nonzero(outcome == HEARD) == run.frames.received[alone].sum()
+    alone = run.sent_frames.collided == 0
+    assert np.count_nonzero(outcome == LOST) == run.sent_frames.lost[alone].sum()
+    assert np.count_nonzero(outcome == HEARD) == run.sent_frames.received[alone].sum()
 
 
 def test_agents_over_udp(tmp_path):

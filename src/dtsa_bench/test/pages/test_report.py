@@ -22,7 +22,7 @@ from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BagWriter
-from dtsa_bench.log.record import load_log
+from dtsa_bench.log.record import SLOT_RECORD, load_log
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
 from dtsa_bench.pages.report.distances import pair_distances
@@ -52,10 +52,10 @@ def test_everything_that_reads_a_run_takes_its_directory_its_bag_and_its_file(fl
     file = next((tmp_path / "a" / "bag").glob("*.mcap"))
     known = load_log(file)
     with Bag(file) as bag:
-        assert load_log(bag).slots.tolist() == known.slots.tolist()
+        assert load_log(bag).digest.tolist() == known.digest.tolist()
     for given in (tmp_path / "a", tmp_path / "a" / "bag", file):
         for path in (given, str(given)):
-            assert load_log(path).slots.tolist() == known.slots.tolist()
+            assert load_log(path).digest.tolist() == known.digest.tolist()
             assert run_data(path)["agents"] == 6
             assert verify_bag(path).mode == "lockstep"
         assert recover(given, tmp_path / f"saved-{given.name}").count > 0
@@ -94,8 +94,8 @@ def test_slots_carry_sender_outcome_and_reason(data: dict[str, Any], flights: di
     for name, path in flights.items():
         slots = data[name]["slots"]
         with Bag(path) as bag:
-            receptions = [typed for _, typed in bag.typed(["/swarm/reception"])]
-            decisions = {typed.slot: typed for _, typed in bag.typed(["/swarm/decision"])}
+            receptions = [typed for _, typed in bag.typed([SLOT_RECORD])][:-1]
+        decisions = {typed.slot: typed for typed in receptions}
         rows = [(one.slot, int(k), one.outcome) for one in receptions for k in one.sender]
         kinds = [
             numbers(slots[key], kind).tolist() for key, kind in (("slot", "<u4"), ("sender", "<u2"), ("outcome", "u1"))
@@ -104,7 +104,7 @@ def test_slots_carry_sender_outcome_and_reason(data: dict[str, Any], flights: di
         names = data[name]["decisions"]["names"]
         for (slot, sender, _), code in zip(rows, numbers(slots["reason"], "u1"), strict=True):
             decision = decisions[slot]
-            assert names[code] == decision.reason_name[decision.reason_index[sender - 1]]
+            assert names[code] == REASONS[decision.reason[sender - 1]]
         assert slots["count"] == len(receptions)
 
 
@@ -132,9 +132,9 @@ def test_distances_and_scene_are_those_of_the_positions(flights: dict[str, Path]
         run = load_log(bag)
     found = pair_distances(run)
     assert found is not None
-    n = len(run.motion.ids)
+    n = run.agents
     brute = {
-        (i + 1, j + 1): np.linalg.norm(run.motion.position[:, :, i] - run.motion.position[:, :, j], axis=1)
+        (i + 1, j + 1): np.linalg.norm(run.path[:, :, i] - run.path[:, :, j], axis=1)
         for i in range(n)
         for j in range(i + 1, n)
     }
@@ -148,8 +148,8 @@ def test_distances_and_scene_are_those_of_the_positions(flights: dict[str, Path]
     times = numbers(scene["time"], "<f4")
     places = numbers(scene["position"], "<i2").reshape(len(times), 3, -1) * scene["scale"]
     for frame in (0, len(times) // 2, len(times) - 1):
-        row = np.abs((run.motion.time_ns - run.start_ns) / 1e9 - times[frame]).argmin()
-        assert np.abs(places[frame] - run.motion.position[row]).max() <= 0.51 * scene["scale"]
+        row = np.abs(run.instants_s - times[frame]).argmin()
+        assert np.abs(places[frame] - run.path[row]).max() <= 0.51 * scene["scale"]
     assert scene["scale"] < 0.001
 
 
@@ -167,11 +167,11 @@ def test_crashes_have_their_agents_time_and_place(crash: tuple[dict[str, Any], P
     found = data["crashes"]
     assert found[0]["ids"] == data["summary"]["collided_pair"]
     assert [one["time_s"] for one in found] == sorted(one["time_s"] for one in found)
-    motion = load_log(directory).motion
+    log = load_log(directory)
     for one in found:
-        a, b = (motion.position[:, :, number - 1] for number in one["ids"])
+        a, b = (log.path[:, :, number - 1] for number in one["ids"])
         near = np.flatnonzero(np.linalg.norm(a - b, axis=1) < 0.2)
-        assert (motion.time_ns[near[0]] - 1_000_000_000) / 1e9 == pytest.approx(one["time_s"], abs=1e-3)
+        assert log.instants_s[near[0]] == pytest.approx(one["time_s"], abs=1e-3)
         assert one["place"] == pytest.approx(((a + b) / 2)[near[0]], abs=1e-3)
     assert len({tuple(one["ids"]) for one in found}) == len(found) > 1
     assert clean["crashes"] == []
