@@ -95,11 +95,15 @@ class FlightRecorder(ChannelObserver):
 
     def agent_silent(self, agent: int) -> None:
         self._state.lose(agent)
+        if self._accounts is not None:
+            self._accounts.lost.add(agent)
         if self._complete >= 0:
             self._write_status()
 
     def agents_back(self, agents: list[int]) -> None:
         self._state.regain(agents)
+        if self._accounts is not None:
+            self._accounts.lost -= set(agents)
         self._write_status()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
@@ -192,6 +196,7 @@ class RealtimeAccounts:
         self._open: dict[int, _Account] = {}
         self._next = 0  # first slot that is not written
         self._unjudged: dict[int, deque[_Frame]] = {}  # by sender
+        self.lost: set[int] = set()  # ids of agents that nothing is waited for from
 
     def _account(self, slot: int) -> _Account | None:
         """The account of a slot; None if it is written already."""
@@ -258,7 +263,10 @@ class RealtimeAccounts:
     def _is_whole(self, slot: int) -> bool:
         """Whether all agents have reported a slot, and what they took in during it, and its frames are judged."""
         here, after = self._open.get(slot), self._open.get(slot + 1)
-        if here is None or after is None or not (here.known.all() and after.known.all()):
+        if here is None or after is None:
+            return False
+        silent = set((np.flatnonzero(~(here.known & after.known)) + 1).tolist())
+        if silent - self.lost:
             return False
         return all(frame.verdict is not None for frame in here.frames.values())
 
