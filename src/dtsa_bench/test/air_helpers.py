@@ -210,4 +210,5 @@ def check_merged(merged: dict[str, Any], whole: Path, decisions: int) -> None:
     assert again["differences"] == []
     assert again["equal"] == again["of"] > decisions
     assert verified(merged)
-    assert verify_bag(whole).to_dict()["difference"] is None
+    difference = verify_bag(whole).to_dict()["difference"]
+    assert difference is None, difference

@@ -71,7 +71,8 @@ class MergedRun:
             "broken_off": self.about["broken_off"],
             "nothing_written": nothing_written,
             "not_determined": not_determined,
-            "frames_heard_not_as_sent": self.about["frames_heard_not_as_sent"] + strange_of(self.lives, sent, complete),
+            "frames_heard_not_as_sent": self.about["frames_heard_not_as_sent"]
+            + strange_of(self.lives, sent, complete, self.about.get("agents_that_gave_up_a_time", ())),
             "decisions_again": again(self.lives, replays),
             "turns": judged(self.lives, sent, self.common_slot),
             "flight": flown,
@@ -124,6 +125,7 @@ def lay(merge: Merge, summary: Mapping[str, Any]) -> MergedRun:
         "residual_us": summary["time_line"]["residual_us"],
         "clocks": summary["time_line"]["clocks"],
         "slot_on_the_first_clock_ns": length,
+        "agents_that_gave_up_a_time": sorted({agent for agent, number in merge.lives if number < 0}),
         "processes": [_process(life, bag) for life, bag in lives.items()],
     }
     return MergedRun(merge.config, first, lives, strays, about)
