@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -25,7 +25,7 @@ PALETTE = {
     "hovering": palette.HOVERING,
     "series": palette.SERIES,
 }
-SCRIPTS = ("core.js", "plot.js", "scene.js", "slots.js")  # of all pages that play a run
+SCRIPTS = ("page.js", "core.js", "plot.js", "scene.js", "slots.js")  # of all pages that play a run
 
 
 @cache
@@ -45,9 +45,20 @@ def _environment() -> Environment:
     return environment
 
 
-def render_page(template: str, **values: Any) -> str:
-    """A page; all values but those of `Markup` are text, whatever is in them."""
-    return _environment().get_template(template).render(**values)
+def render_page(
+    kind: str, title: str, scripts: Sequence[str], data: Mapping[str, Any], *, styles: Sequence[str] = ("style.css",),
+    served: bool = False, **values: Any,
+) -> str:  # fmt: skip
+    """Return a page; all values but those of `Markup` are text, whatever is in them.
+
+    :param kind: class of its body.
+    :param data: what its scripts read, JSON types.
+    :param served: whether scripts and styles have addresses of their own; else they stand in the page.
+    """
+    return (
+        _environment().get_template("page.html")
+        .render(kind=kind, title=title, scripts=scripts, data=data, styles=styles, served=served, **values)
+    )  # fmt: skip
 
 
 def write_page(path: Path, page: str) -> None:

@@ -121,10 +121,7 @@ class ViewServer:
 
     async def _page(self, _: web.Request) -> web.Response:
         data = {"runs": [], "palette": PALETTE, "reasons": dict(REASON_TEXTS), "control": self._order is not None}
-        page = render_page(
-            "page.html", served=True, kind="view", title="DTSA, live", styles=_STYLES,
-            scripts=(*SCRIPTS, "view.js"), data=data,
-        )  # fmt: skip
+        page = render_page("view", "DTSA, live", (*SCRIPTS, "view.js"), data, styles=_STYLES, served=True)
         return web.Response(text=page, content_type="text/html")
 
     async def _asset(self, request: web.Request) -> web.Response:
