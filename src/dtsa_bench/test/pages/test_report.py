@@ -301,7 +301,8 @@ def test_chromium_plays_on_from_where_it_stood_marks_crashes_and_prints(crash, t
 
 
 HINT = """(title => {
-  const section = [...document.querySelectorAll("section")].find(node => node.querySelector("h2")?.textContent === title);
+  const heading = [...document.querySelectorAll("section h2")].find(node => node.textContent === title);
+  const section = heading.parentElement;
   const box = section.querySelector(".scroll"), hint = section.querySelector(".hint");
   const state = () => [hint.hidden, hint.textContent], first = state();
   box.scrollTo(box.scrollWidth, box.scrollHeight);

@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
 from PIL import Image
 
 from dtsa_bench.drawing.flight_paths import frame_bare, paint
@@ -25,6 +26,8 @@ from .flights import AGENTS, KILLED, LIVE_AGENTS, LIVE_SLOT_MS, DemoFlight, Fini
 HOVER = "#c3ccd6"  # of cells: an agent that hovers has nothing new to say
 FIRST, COUNT = 100, 40  # the slots that are shown, well under way
 ROUNDS = 16  # columns of each part around a death or a return
+FRAME_MS, LAST_FRAME_MS = 90, 3500  # of the animation
+_RGB = np.array([1 << 16, 1 << 8, 1])  # a colour as one number
 WIDTH, LEFT, RIGHT = 8.6, 0.4, 0.4  # inches, of the picture and its margins
 TITLE = "One radio channel, twelve quadcopters: who speaks next?"
 INTRO = (
@@ -304,19 +307,34 @@ def draw_animation(path: Path, flights: Flights, slots: int = 80) -> None:
             strip = sheet.axes(1.6, top + 0.6, 7.04, 0.52)
             strip.set(xlim=(0, across), ylim=(2, 0))
             drawn.append((finished, sheet.axes(0.1, top + 0.06, 1.3, 1.3), strip))
-        writer = PillowWriter(fps=11)
-        with writer.saving(sheet.figure, path, 100):
-            for frame in range(slots):
-                for finished, view, strip in drawn:
-                    slot = min(FIRST + frame, len(finished.senders) - 1)
-                    cell = frame % across, frame // across, finished.senders[slot] if slot == FIRST + frame else ()
-                    draw_cells(strip, finished, [cell], 7)
-                    view.clear()
-                    paint(view, finished.position[: slot + 1], finished.scenario.moving, ids=False, scale=0.62)
-                    senders = [sender - 1 for sender in finished.senders[slot]]
-                    shade = COLLIDED if len(senders) > 1 else INK
-                    view.plot(*finished.position[slot][:2, senders], "o", mfc="none", mec=shade, ms=13, mew=1.4)
-                    frame_bare(view, finished.position)
-                writer.grab_frame()
-            for _ in range(38):  # the last one stays
-                writer.grab_frame()
+        canvas, pictures = FigureCanvasAgg(sheet.figure), []
+        for frame in range(slots):
+            for finished, view, strip in drawn:
+                slot = min(FIRST + frame, len(finished.senders) - 1)
+                cell = frame % across, frame // across, finished.senders[slot] if slot == FIRST + frame else ()
+                draw_cells(strip, finished, [cell], 7)
+                view.clear()
+                paint(view, finished.position[: slot + 1], finished.scenario.moving, ids=False, scale=0.62)
+                senders = [sender - 1 for sender in finished.senders[slot]]
+                shade = COLLIDED if len(senders) > 1 else INK
+                view.plot(*finished.position[slot][:2, senders], "o", mfc="none", mec=shade, ms=13, mew=1.4)
+                frame_bare(view, finished.position)
+            canvas.draw()
+            pictures.append(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
+    durations = [FRAME_MS] * (slots - 1) + [LAST_FRAME_MS]
+    first, *rest = _with_one_palette(pictures)
+    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
+
+
+def _with_one_palette(pictures: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:
+    """Pictures, (H, W, 3) each, in the 255 most frequent colours of the last: what does not move does not change."""
+    colours, counts = np.unique(pictures[-1] @ _RGB, return_counts=True)
+    palette = colours[np.argsort(-counts, kind="stable")[:255]][:, None] // _RGB % 256
+    frames = []
+    for picture in pictures:
+        shades, index = np.unique(picture @ _RGB, return_inverse=True)
+        nearest = ((shades[:, None, None] // _RGB % 256 - palette) ** 2).sum(axis=2).argmin(axis=1).astype(np.uint8)
+        frame = Image.fromarray(nearest[index.reshape(picture.shape[:2])])
+        frame.putpalette(palette.astype(np.uint8).tobytes())
+        frames.append(frame)
+    return frames
