@@ -26,8 +26,8 @@ from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
 from dtsa_bench.network.sniffer import Sniffer
+from dtsa_bench.pages.view.history import MAX_MOMENTS, RunHistory
 from dtsa_bench.pages.view.network_listener import NetworkListener
-from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
 from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
 from dtsa_bench.recordings.merge.merge import Merge, verified
@@ -181,12 +181,12 @@ def hear_each_other(agents: Sequence[Flying], frames: int) -> None:
 @contextmanager
 def listening(config: SwarmConfig, settings: PortSettings) -> Iterator[Callable[[], list[dict[str, Any]]]]:
     """A page's listener; what is given are the moments that it has told so far."""
-    track = Track("listener")
-    source = NetworkListener(track, config, settings)
+    history = RunHistory("listener")
+    source = NetworkListener(history, config, settings)
     thread = threading.Thread(target=source.run)
     thread.start()
     try:
-        yield lambda: [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
+        yield lambda: [json.loads(moment.text) for moment in history.since(0, MAX_MOMENTS)[1]]
     finally:
         source.stopped = True
         thread.join()

@@ -18,7 +18,7 @@ from bag_helpers import flight_bag
 
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
 from dtsa_bench.pages.view.follower import Follower
-from dtsa_bench.pages.view.track import Track
+from dtsa_bench.pages.view.history import RunHistory
 from dtsa_bench.recordings.bag.reader import Bag
 
 SLOTS, AGENTS = 150, 6
@@ -31,12 +31,12 @@ def lossy_bag(directory: Path) -> Path:
     return bag
 
 
-def track_of(bag: Path) -> Track:
+def history_of(bag: Path) -> RunHistory:
     """All of a lockstep bag, as a page gets it from the ROS graph while it is flown."""
-    track = Track("lossy")
-    follower = Follower(track, {})
+    history = RunHistory("lossy")
+    follower = Follower(history, {})
     with Bag(bag) as opened:
-        follower.begin(opened.config)
+        follower.start(opened.config)
         sent: dict[int, Any] = {}
         for _, message in opened.typed(["/swarm/transmission", "/swarm/reception"]):
             if hasattr(message, "track"):
@@ -49,7 +49,7 @@ def track_of(bag: Path) -> Track:
             follower.receive("Reception", message)
     follower.finish("recorded")
     assert not follower.unusable
-    return track
+    return history
 
 
 def markers_of(answer: Any) -> SimpleNamespace:
@@ -98,10 +98,10 @@ def viewed_flight(out: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str
 
 
 @contextmanager
-def on_graph(track: Track, domain: int) -> Iterator[Any]:
+def on_graph(history: RunHistory, domain: int) -> Iterator[Any]:
     from dtsa_bench.pages.view.graph import GraphSource  # needs ROS
 
-    source = GraphSource(track, domain, control=True)
+    source = GraphSource(history, domain, control=True)
     listening = threading.Thread(target=source.run, daemon=True)
     listening.start()
     try:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from dtsa_agent.air.datagram import link_of
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.station import StationSettings
-from dtsa_bench.pages.view.network_listener import HeardRun
-from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
+from dtsa_bench.pages.view.history import MAX_MOMENTS, RunHistory
+from dtsa_bench.pages.view.network_listener import ListenedRun
 
 CONFIG = SwarmConfig(agents=3, policy="tdma", slot_ms=50.0)
 FIRST = 300
@@ -22,8 +22,8 @@ FIRST = 300
 
 class Heard:
     def __init__(self) -> None:
-        self._track = Track("listener")
-        self._run = HeardRun(self._track, CONFIG, "udp", FIRST, 0)
+        self._history = RunHistory("listener")
+        self._run = ListenedRun(self._history, CONFIG, "udp", FIRST, 0)
         self._datagrams = StationSettings(CONFIG, link_of(CONFIG))
 
     def slots(self, first: int, end: int, senders: tuple[int, ...]) -> None:
@@ -34,12 +34,12 @@ class Heard:
             if sender in senders:
                 place = ((slot - FIRST) * CONFIG.slot_s, float(sender), 1.0)
                 frame = encode_frame(Frame(sender, slot, 1, place, (1.0, 0.0, 0.0)))
-                said = self._datagrams.read(self._datagrams.write(frame, slot))
-                assert (said.fault, self._run.hear(said, said.frame, 0, now)) == ("", "")
-            self._run.tell(Counter(), now)
+                datagram = self._datagrams.read(self._datagrams.write(frame, slot))
+                assert (datagram.fault, self._run.receive(datagram, datagram.frame, 0, now)) == ("", "")
+            self._run.advance(Counter(), now)
 
     def moments(self) -> list[dict[str, Any]]:
-        return [json.loads(moment.text) for moment in self._track.since(0, MOST_MOMENTS)[1]]
+        return [json.loads(moment.text) for moment in self._history.since(0, MAX_MOMENTS)[1]]
 
 
 def places(moment: dict[str, Any]) -> NDArray[np.float32]:

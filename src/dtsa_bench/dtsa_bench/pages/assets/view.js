@@ -56,7 +56,7 @@ requestAnimationFrame(tick);
 
 /* ---- the run ---- */
 function makeView(run) {
-  const panels = new Panels(run, DATA.control && run.control ? content => send({order: content}) : null, agent => send({ghosts: agent}));
+  const panels = new Panels(run, DATA.control && run.control ? content => send({command: content}) : null, agent => send({ghosts: agent}));
   const chart = (name, what, ...rest) => el("section", {class: "half"}, el("h2", {}, name), el("p", {class: "what"}, what), ...rest);
   const strip = new SlotLine(run), color = ["success", "collision", "idle"].map(name => () => theme.color(name));
   const series = (data, colors, most, unit, label, digits, suffix, limits = []) => lineChart({time: data.time, unit, label, digits, suffix, limits, height: 180, high: most,
@@ -103,7 +103,7 @@ function begin(info) {
 /* Beside a run where there is one; alone before it begins. */
 function showVehicles(message) {
   if (!live.crazyflies) {
-    live.crazyflies = new Crazyflies(DATA.control ? content => send({order: content}) : null);
+    live.crazyflies = new Crazyflies(DATA.control ? content => send({command: content}) : null);
     (live.view ? live.view.node.querySelector(".side") : main).prepend(live.crazyflies.node);
   }
   live.crazyflies.show(message.rows, message.answer);
