@@ -18,21 +18,21 @@ from dtsa_bench.recordings.tables.ages import follow_run
 from dtsa_bench.recordings.tables.followed import Ages
 from dtsa_bench.runs.hearing import recorded_problem, sentence
 
-from .distances import collision_m, crashes_of, distance_charts, pair_distances
+from .distances import collision_m, distance_chart, list_crashes, pair_distances
 
 SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second
 SCENE_VALUES = 600_000  # most numbers in the replay: longer runs of larger swarms get fewer frames
 UNKNOWN = -32768  # in the replay: it is not known where the agent was
-VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
-EVENTS = 1000  # of a mission, most that are shown
+VEHICLE_VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
+MAX_EVENTS = 1000  # of a mission
 
 Array = NDArray[np.float64]
 
 
 def run_data(path: str | Path) -> dict[str, Any]:
-    """All that the page shows of one run (run directory, bag directory or .mcap file), as JSON types.
+    """Return all that the page shows of one run (run directory, bag directory or .mcap file), as JSON types.
 
-    :raises UnusableBag: if it is none of a swarm's run.
+    :raises UnusableBag: if it has no run of a swarm.
     """
     with Bag(path) as bag:
         run = load_run(bag)
@@ -43,9 +43,9 @@ def run_data(path: str | Path) -> dict[str, Any]:
     followed = follow_run(run)
     scenario, ages = followed.scenario, followed.ages
     notes += followed.notes
-    told = sentence(recorded_problem(file))
-    if told and not any(note.startswith(told.partition(":")[0]) for note in notes):
-        notes.append(told)
+    problem = sentence(recorded_problem(file))
+    if problem and not any(note.startswith(problem.partition(":")[0]) for note in notes):
+        notes.append(problem)
     if unknown := int((~run.outcome_known).sum()):
         notes.append(f"Of {unknown} slots it is not known whether somebody sent: not all agents have told of them.")
     summary = followed.summary | _counts(run)
@@ -58,29 +58,26 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "notes": notes,
         "config": flatten(run.config),
         "agents": run.agents,
-        "crashes": crashes_of(distances, run, summary),
+        "crashes": list_crashes(distances, run, summary),
         "moving": scenario.moving.tolist() if scenario else [True] * run.agents,
         "slot_s": run.slot_ns / 1e9,
         "duration_s": _duration_s(run),
         "summary": summary,
         "scene": _scene(run, scenario),
         "slots": _slots(run),
-        "channel": _channel(run),
+        "channel": _channel_use(run),
         "decisions": _reasons(run),
         "sent_for": _sent_for(run),
-        "distances": distance_charts(distances, run),
+        "distances": distance_chart(distances, run),
         "ages": _ages(ages, run),
         "table": _table(run, ages, scenario),
     }
 
 
 def _duration_s(run: RecordedRun) -> float:
-    ends = [0.0]
-    if len(run.slots):
-        ends.append((int(run.slots[-1]) + 1) * run.slot_ns / 1e9)
-    if len(run.motion.time_ns):
-        ends.append((int(run.motion.time_ns[-1]) - run.start_ns) / 1e9)
-    return max(ends)
+    last_slot = (int(run.slots[-1]) + 1) * run.slot_ns if len(run.slots) else 0
+    last_position = int(run.motion.time_ns[-1]) - run.start_ns if len(run.motion.time_ns) else 0
+    return max(last_slot, last_position) / 1e9
 
 
 def _counts(run: RecordedRun) -> dict[str, Any]:
@@ -107,27 +104,26 @@ def _scene(run: RecordedRun, scenario: Scenario | None) -> dict[str, Any] | None
     frames = int(min(duration * SCENE_HZ, SCENE_VALUES / (3 * len(motion.ids)))) + 2
     index = np.unique(np.linspace(0, len(motion.time_ns) - 1, min(frames, len(motion.time_ns))).astype(int))
     known = np.isfinite(motion.position[index]) | (run.told is None)
-    place = np.nan_to_num(motion.position[index])
-    span = max(1.0, float(np.abs(place).max()))
-    scale = span / 32000
-    targets = scenario.target if scenario else place[-1]
-    place = np.where(known, place, scale * UNKNOWN)
+    position = np.nan_to_num(motion.position[index])
+    scale = max(1.0, float(np.abs(position).max())) / 32000
+    targets = scenario.target if scenario else position[-1]
+    position = np.where(known, position, scale * UNKNOWN)
     return {
         "ids": motion.ids.tolist(),
         "time": pack(((motion.time_ns[index] - run.start_ns) / 1e9).astype("<f4")),
-        "position": pack(np.round(place / scale).astype("<i2")),
+        "position": pack(np.round(position / scale).astype("<i2")),
         "scale": scale,
         "target": np.round(targets, 3).T.tolist(),
     }
 
 
 def _slots(run: RecordedRun) -> dict[str, Any]:
-    """Every frame that was sent: in which slot, by whom, why, and what became of it."""
+    """Every frame: its slot, sender, reason, outcome and share of receivers."""
     frames = run.frames
     outcome = np.zeros(len(frames.slot), np.uint8)
     if len(run.slots):
-        place = np.minimum(np.searchsorted(run.slots, frames.slot), len(run.slots) - 1)
-        outcome = run.outcome[place].astype(np.uint8)
+        row = np.minimum(np.searchsorted(run.slots, frames.slot), len(run.slots) - 1)
+        outcome = run.outcome[row].astype(np.uint8)
     share = frames.received.sum(axis=1) / np.maximum(1, run.known_receivers)
     return {
         "slot": pack(frames.slot.astype("<u4")),
@@ -142,16 +138,15 @@ def _slots(run: RecordedRun) -> dict[str, Any]:
 
 
 def _sender_reason(run: RecordedRun) -> NDArray[np.int64]:
-    """Why each frame was sent, as its sender decided; 255 where that was not recorded."""
+    """Reason of each frame's sender; 255 where it was not recorded."""
     decisions, frames = run.decisions, run.frames
     reason = np.full(len(frames.slot), 255, np.int64)
     if not len(decisions.slot) or not len(frames.slot):
         return reason
     row = np.minimum(np.searchsorted(decisions.slot, frames.slot), len(decisions.slot) - 1)
-    same = decisions.slot[row] == frames.slot
-    mine = decisions.agent[row] == frames.sender[:, None]
-    found = same & mine.any(axis=1)
-    reason[found] = decisions.reason[row[found], mine[found].argmax(axis=1)]
+    is_sender = decisions.agent[row] == frames.sender[:, None]
+    known = (decisions.slot[row] == frames.slot) & is_sender.any(axis=1)
+    reason[known] = decisions.reason[row[known], is_sender[known].argmax(axis=1)]
     return reason
 
 
@@ -169,7 +164,7 @@ def _bin_of(run: RecordedRun, slots: NDArray[np.int64]) -> tuple[NDArray[np.int6
     return np.clip((slots - first) * count // (last - first + 1), 0, count - 1), count, middle
 
 
-def _channel(run: RecordedRun) -> dict[str, Any] | None:
+def _channel_use(run: RecordedRun) -> dict[str, Any] | None:
     if not len(run.slots):
         return None
     bins, count, middle = _bin_of(run, run.slots)
@@ -179,9 +174,9 @@ def _channel(run: RecordedRun) -> dict[str, Any] | None:
     frames = run.frames
     lost, offered = np.zeros(count), np.zeros(count)
     if len(frames.slot):
-        place, _, _ = _bin_of(run, frames.slot)
-        np.add.at(lost, place, frames.lost)
-        np.add.at(offered, place, np.maximum(run.told is None, run.known_receivers))
+        frame_bins, _, _ = _bin_of(run, frames.slot)
+        np.add.at(lost, frame_bins, frames.lost)
+        np.add.at(offered, frame_bins, np.maximum(run.told is None, run.known_receivers))
     return {
         "time": thin(middle),
         "share": {name: thin(shares[index]) for index, name in enumerate(OUTCOMES)},
@@ -238,14 +233,15 @@ def _table(run: RecordedRun, ages: Ages | None, scenario: Scenario | None) -> li
     frames, motion = run.frames, run.motion
     rows = []
     for agent in range(1, run.agents + 1):
-        mine = frames.sender == agent
-        sent = int(mine.sum())
+        own = frames.sender == agent
+        offered = int(run.known_receivers[own].sum())
+        known_share = own.any() and (offered or run.told is None)
         row: dict[str, Any] = {
             "id": agent,
             "moving": bool(scenario.moving[agent - 1]) if scenario else None,
-            "sent": sent,
-            "heard": _heard_share(run, mine),
-            "collided": int((frames.collided[mine] > 0).sum()) if run.merged is None else None,
+            "sent": int(own.sum()),
+            "heard": round(float(frames.received[own].sum()) / max(1, offered), 4) if known_share else None,
+            "collided": int((frames.collided[own] > 0).sum()) if run.merged is None else None,
         }
         if ages is not None:
             column = ages.results, agent - 1
@@ -256,24 +252,15 @@ def _table(run: RecordedRun, ages: Ages | None, scenario: Scenario | None) -> li
         place = np.flatnonzero(motion.ids == agent)
         if len(place) and len(motion.time_ns) > 1:
             track = motion.position[:, :, place[0]]
-            known = np.isfinite(track).all(axis=1)
-            steps = np.diff(track[known], axis=0)
-            if known.any():
-                row["path"] = round(float(np.sqrt((steps**2).sum(axis=1)).sum()), 3)
+            track = track[np.isfinite(track).all(axis=1)]
+            if len(track):
+                row["path"] = round(float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum()), 3)
         rows.append(row)
     return rows
 
 
-def _heard_share(run: RecordedRun, mine: NDArray[np.bool_]) -> float | None:
-    """Share of an agent's receivers that received its frames; None without any of which it is known."""
-    offered = int(run.known_receivers[mine].sum())
-    if not mine.any() or (run.told is not None and not offered):
-        return None
-    return round(float(run.frames.received[mine].sum()) / max(1, offered), 4)
-
-
 def mission_data(path: str | Path) -> dict[str, Any] | None:
-    """What `mission.json` beside a bag says of a mission with Crazyflies; None: there is none."""
+    """Return the contents of `mission.json` beside the bag of a mission with Crazyflies; None: there is none."""
     place = Path(path)
     for directory in (place, place.parent, place.parent.parent):
         file = directory / "mission.json"
@@ -282,16 +269,12 @@ def mission_data(path: str | Path) -> dict[str, Any] | None:
     else:
         return None
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-        vehicles = [
-            [
-                str(name),
-                *(values.get(key) for key in VALUES),
-                " → ".join(str(s["state"]) for s in values["states"]),
-            ]
-            for name, values in found["vehicles"].items()
-        ]
-        events = [[float(e["t_s"]), str(e["level"]), str(e["text"])] for e in found["events"]]
-        return {"cut_short": str(found["cut_short"]), "vehicles": vehicles, "events": events[:EVENTS]}
+        mission = json.loads(file.read_text(encoding="utf-8"))
+        vehicles = []
+        for name, values in mission["vehicles"].items():
+            states = " → ".join(str(state["state"]) for state in values["states"])
+            vehicles.append([str(name), *(values.get(key) for key in VEHICLE_VALUES), states])
+        events = [[float(event["t_s"]), str(event["level"]), str(event["text"])] for event in mission["events"]]
+        return {"cut_short": str(mission["cut_short"]), "vehicles": vehicles, "events": events[:MAX_EVENTS]}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None

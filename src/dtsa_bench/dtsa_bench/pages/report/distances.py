@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dtsa_bench.pages.html import reduce_bins, thin
 from dtsa_bench.recordings.bag.run import RecordedRun, swarm_section
 
-CRASHES = 50  # most that are shown
+MAX_CRASHES = 50  # that are shown
 PAIRS = 5  # closest pairs whose distance is drawn
 BLOCK = 512  # moments whose pair distances are computed at once
 
@@ -32,7 +32,7 @@ class Distances:
 
 
 def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | None:
-    """Distances at the recorded moments, and pairs below `collision_m`; None with fewer than two agents."""
+    """Return the distances at the recorded moments, and pairs below `collision_m`; None with fewer than two agents."""
     motion = run.motion
     count = len(motion.ids)
     if count < 2 or not len(motion.time_ns):
@@ -42,12 +42,12 @@ def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | No
     closest = np.full(len(first), np.inf)
     touched = np.full(len(first), -1)
     for start in range(0, len(least), BLOCK):
-        place = motion.position[start : start + BLOCK]
-        apart = np.sqrt(((place[:, :, first] - place[:, :, second]) ** 2).sum(axis=1))
-        apart[np.isnan(apart)] = np.inf
-        least[start : start + BLOCK] = apart.min(axis=1)
-        np.minimum(closest, apart.min(axis=0), out=closest)
-        near = apart < collision_m
+        position = motion.position[start : start + BLOCK]
+        distance = np.sqrt(((position[:, :, first] - position[:, :, second]) ** 2).sum(axis=1))
+        distance[np.isnan(distance)] = np.inf
+        least[start : start + BLOCK] = distance.min(axis=1)
+        np.minimum(closest, distance.min(axis=0), out=closest)
+        near = distance < collision_m
         new = near.any(axis=0) & (touched < 0)
         touched[new] = start + near[:, new].argmax(axis=0)
     chosen = [k for k in np.argsort(closest, kind="stable")[:PAIRS] if math.isfinite(closest[k])]
@@ -55,9 +55,9 @@ def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | No
     for k in chosen:
         gap = motion.position[:, :, first[k]] - motion.position[:, :, second[k]]
         series.append(np.sqrt((gap**2).sum(axis=1)))
-    pairs = [(int(motion.ids[first[k]]), int(motion.ids[second[k]])) for k in chosen]
-    ids = motion.ids
-    crashes = [(int(ids[first[k]]), int(ids[second[k]]), int(touched[k])) for k in np.flatnonzero(touched >= 0)]
+    ids = motion.ids.tolist()
+    pairs = [(ids[first[k]], ids[second[k]]) for k in chosen]
+    crashes = [(ids[first[k]], ids[second[k]], int(touched[k])) for k in np.flatnonzero(touched >= 0)]
     crashes.sort(key=lambda crash: crash[2])
     return Distances((motion.time_ns - run.start_ns) / 1e9, least, pairs, series, crashes)
 
@@ -68,34 +68,34 @@ def collision_m(run: RecordedRun) -> float:
     return float(limits.get("collision_m", 0.2)) if isinstance(limits, Mapping) else 0.2
 
 
-def crashes_of(distances: Distances | None, run: RecordedRun, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Which agents crashed, when and where; the first ones if there are many."""
+def list_crashes(distances: Distances | None, run: RecordedRun, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the agents, times and places of crashes; the first ones if there are many."""
     if distances is None:
         return []
-    found = list(distances.crashes)
+    crashes = distances.crashes
     pair = tuple(summary.get("collided_pair") or ())
     motion = run.motion
-    places = {int(number): place for place, number in enumerate(motion.ids)}
-    if not found and len(pair) == 2 and set(pair) <= places.keys():
+    places = {agent: place for place, agent in enumerate(motion.ids.tolist())}
+    if not crashes and len(pair) == 2 and set(pair) <= places.keys():
         # They crashed within a slot, and only its ends were recorded.
         gap = motion.position[:, :, places[pair[0]]] - motion.position[:, :, places[pair[1]]]
-        found = [(*pair, int(np.nanargmin((gap**2).sum(axis=1))))]
-    crashes = []
-    for one, other, moment in found[:CRASHES]:
-        a, b = (motion.position[moment, :, places[number]] for number in (one, other))
-        crashes.append(
+        crashes = [(*pair, int(np.nanargmin((gap**2).sum(axis=1))))]
+    rows = []
+    for first, second, moment in crashes[:MAX_CRASHES]:
+        a, b = (motion.position[moment, :, places[agent]] for agent in (first, second))
+        rows.append(
             {
-                "ids": [one, other],
+                "ids": [first, second],
                 "time_s": round(float(distances.time_s[moment]), 3),
                 "place": thin((a + b) / 2, 3),
                 "distance_m": round(float(np.linalg.norm(a - b)), 4),
             }
         )
-    return crashes
+    return rows
 
 
-def distance_charts(distances: Distances | None, run: RecordedRun) -> dict[str, Any] | None:
-    """Distances over time as a page shows them, and what they are compared with."""
+def distance_chart(distances: Distances | None, run: RecordedRun) -> dict[str, Any] | None:
+    """Return distances over time as a page shows them, and what they are compared with."""
     if distances is None:
         return None
     return {
