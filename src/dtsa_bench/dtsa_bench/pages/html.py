@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,7 @@ def render_page(
 ) -> str:  # fmt: skip
     """Return a page; all values but those of `Markup` are text, whatever is in them.
 
-    :param kind: class of its body.
-    :param data: what its scripts read, JSON types.
+    :param data: what its scripts read, as JSON types.
     :param served: whether scripts and styles have addresses of their own; else they stand in the page.
     """
     return (
@@ -83,15 +83,9 @@ def flatten(config: Mapping[str, Any], section: str = "") -> list[list[Any]]:
 
 def reduce_bins(values: NDArray[Any], how: Any) -> NDArray[np.float64]:
     """(BINS or fewer,) from (T,): `how` applied to each of the bins; NaN where a bin holds nothing finite."""
-    count = min(BINS, len(values))
-    edges = np.linspace(0, len(values), count + 1).astype(int)
-    result = np.full(count, np.nan)
-    for index in range(count):
-        part = values[edges[index] : edges[index + 1]]
-        part = part[np.isfinite(part)]
-        if len(part):
-            result[index] = how(part)
-    return result
+    edges = np.linspace(0, len(values), min(BINS, len(values)) + 1).astype(int)
+    parts = (values[first:end][np.isfinite(values[first:end])] for first, end in pairwise(edges))
+    return np.array([how(part) if len(part) else math.nan for part in parts], np.float64)
 
 
 def thin(values: NDArray[Any], digits: int = 4) -> list[float | None]:

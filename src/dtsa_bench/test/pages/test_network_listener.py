@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.air.datagram import link_of
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
-from dtsa_agent.core.station import StationSettings
+from dtsa_agent.core.station import ParsedDatagram, StationSettings
 from dtsa_bench.pages.view.history import MAX_MOMENTS, RunHistory
 from dtsa_bench.pages.view.network_listener import ListenedRun
 
@@ -32,11 +32,19 @@ class Heard:
             sender = slot % CONFIG.agents + 1
             now = slot * CONFIG.slot_ns
             if sender in senders:
-                place = ((slot - FIRST) * CONFIG.slot_s, float(sender), 1.0)
-                frame = encode_frame(Frame(sender, slot, 1, place, (1.0, 0.0, 0.0)))
-                datagram = self._datagrams.read(self._datagrams.write(frame, slot))
-                assert (datagram.fault, self._run.receive(datagram, datagram.frame, 0, now)) == ("", "")
+                assert self.receive(self.datagram(slot)) == ""
             self._run.advance(Counter(), now)
+
+    def datagram(self, slot: int) -> ParsedDatagram:
+        sender = slot % CONFIG.agents + 1
+        place = ((slot - FIRST) * CONFIG.slot_s, float(sender), 1.0)
+        frame = encode_frame(Frame(sender, slot, 1, place, (1.0, 0.0, 0.0)))
+        datagram = self._datagrams.read(self._datagrams.write(frame, slot))
+        assert datagram.fault == ""
+        return datagram
+
+    def receive(self, datagram: ParsedDatagram) -> str:
+        return self._run.receive(datagram, datagram.frame, 0, datagram.slot * CONFIG.slot_ns)
 
     def moments(self) -> list[dict[str, Any]]:
         return [json.loads(moment.text) for moment in self._history.since(0, MAX_MOMENTS)[1]]
@@ -60,3 +68,15 @@ def test_who_falls_silent_is_shown_where_it_was_heard_last_and_comes_back() -> N
     again = heard.moments()[-1]
     assert again["absent"] == []
     np.testing.assert_allclose(places(again)[0], (again["slot"] - FIRST) * CONFIG.slot_s, atol=0.2)
+
+
+def test_bytes_that_are_no_frame_are_not_shown() -> None:
+    """Also where a holder of the key signed them, so that the datagram is accepted."""
+    heard = Heard()
+    heard.slots(FIRST, FIRST + 12, (1, 2, 3))
+    good = heard.datagram(FIRST + 12)
+    garbage = good.frame[:8] + b"\xff" * (len(good.frame) - 8)
+    assert heard.receive(good._replace(frame=garbage)) == ""
+    heard.slots(FIRST + 13, FIRST + 40, ())
+    sent = [np.frombuffer(base64.b64decode(moment["frames"]["slot"]), "<u4") for moment in heard.moments()]
+    assert np.concatenate(sent).max() == FIRST + 11

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -77,8 +78,12 @@ def draw_demo(path: Path, steps: Sequence[Sequence[DemoFlight]], flights: Flight
         sheet = _Sheet(12.5)
         sheet.text(LEFT, 0.3, TITLE, 15.5, fontweight="bold")
         sheet.text(LEFT, 0.68, textwrap.fill(INTRO, 118), 9, color=QUIET)
-        draws: tuple[Callable[[_Sheet, float, Sequence[FinishedFlight]], None], ...]
-        draws = (_draw_paths, _draw_ages, _draw_losses, _draw_killing)
+        draws: tuple[Callable[[_Sheet, float, Sequence[FinishedFlight]], None], ...] = (
+            _draw_paths,
+            partial(_draw_strips, head="known state is\nthis old", value="age"),
+            partial(_draw_strips, head="position is\nwrong by", value="error"),
+            _draw_killing,
+        )
         for number, (top, step, draw) in enumerate(zip((1.22, 3.98, 6.88, 9.84), steps, draws, strict=True), 1):
             title, sentence = step_text(number, flights)
             sheet.rule(top)
@@ -167,24 +172,16 @@ def _draw_paths(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> No
     axes.set_title("how far off the others are thought to be (mm)", fontsize=7.8, fontweight="normal", pad=5)
 
 
-def _draw_ages(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> None:
-    _draw_strips(sheet, top, step, "known state is\nthis old", [finished.age for finished in step])
-
-
-def _draw_losses(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> None:
-    _draw_strips(sheet, top, step, "position is\nwrong by", [finished.error for finished in step])
-
-
-def _draw_strips(sheet: _Sheet, top: float, step: Sequence[FinishedFlight], head: str, values: Sequence[str]) -> None:
+def _draw_strips(sheet: _Sheet, top: float, step: Sequence[FinishedFlight], head: str, value: str) -> None:
     """Steps 2 and 3: which agents sent in each slot."""
     _top_view(sheet.axes(LEFT, top + 0.03, 1.42, 1.42), step[-1])
     sheet.text(WIDTH - RIGHT, top - 0.02, head, 7, color=QUIET, ha="right")
     first, width = slots_shown(step), 4.12
-    for index, (finished, value) in enumerate(zip(step, values, strict=True)):
+    for index, finished in enumerate(step):
         y = top + 0.28 + 0.36 * index
         sheet.text(1.98, y - 0.03, finished.flight.name, 8.6, fontweight="bold")
         sheet.text(1.98, y + 0.125, finished.flight.does, 6.4, color=QUIET)
-        sheet.text(WIDTH - RIGHT, y - 0.01, value, 9.5, fontweight="bold", ha="right")
+        sheet.text(WIDTH - RIGHT, y - 0.01, getattr(finished, value), 9.5, fontweight="bold", ha="right")
         axes = sheet.axes(3.32, y, width, width / COUNT * 1.6)
         draw_cells(axes, finished, [(x, 0, finished.senders[first + x]) for x in range(COUNT)], 5.2)
         axes.set(xlim=(0, COUNT), ylim=(0, 1))

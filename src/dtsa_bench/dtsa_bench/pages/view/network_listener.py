@@ -14,12 +14,11 @@ from dtsa_agent.air.datagram import frame_in, link_of
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_listener
 from dtsa_agent.core import SwarmConfig, make_scenario
-from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
-from dtsa_agent.core.frame import decode_extended, decode_frame
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.frame import decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.station import (
     EARLY_COUNT,
-    NO_FRAME,
     OTHER_TIME,
     REPEATED,
     TOO_EARLY,
@@ -196,8 +195,6 @@ class NetworkListener:
         datagram = self._datagrams.read(data)
         if datagram.fault:
             return datagram.fault
-        if not self._is_frame(datagram.frame):
-            return NO_FRAME
         slot, run = datagram.slot, self._run
         zero_ns = arrival_ns - self._flight_ns - datagram.late_ns - slot * self._config.slot_ns
         if run is not None and slot < run.slot and now_ns - run.received_ns < _SILENCE_NS:
@@ -215,11 +212,3 @@ class NetworkListener:
             self._run = None
         else:
             run.advance(self.refused, now_ns)
-
-    def _is_frame(self, frame: bytes) -> bool:
-        """Whether bytes are a frame: nothing else may set the time."""
-        try:
-            decode_frame(self._config.protocol_part(frame), self._config.extent_m)
-        except RemoteProtocolError:
-            return False
-        return True
