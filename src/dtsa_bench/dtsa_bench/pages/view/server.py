@@ -88,6 +88,8 @@ class ViewServer:
     async def stop(self, wait_s: float = 0.0) -> None:
         """Disconnect all pages, and end; `wait_s`: for pages to receive what they do not have yet."""
         deadline = time.monotonic() + wait_s
+        for stream in self._pages.values():
+            stream.is_behind = True  # until it has found nothing more to send
         while time.monotonic() < deadline and any(stream.is_behind for stream in self._pages.values()):
             await asyncio.sleep(0.02)
         for page in list(self._pages):
@@ -175,6 +177,7 @@ class _PageStream:
         self._chosen = 0  # agent whose beliefs it shows
         self._next_belief = 0
         self.answer = ""  # to its last command
+        self.is_behind = True  # whether there may be something that the page has not been sent
         self._ended = False
 
     def choose(self, agent: int) -> None:
@@ -187,12 +190,11 @@ class _PageStream:
         """Send what is new until the page disconnects."""
         try:
             while not self._page.closed and not self._ended:
-                for content in self._updates():
-                    await self._send(content)
-                if self.answer:
-                    content, self.answer = json.dumps({"kind": "answer", "text": self.answer}), ""
-                    await self._send(content)
-                await asyncio.sleep(1 / RATE_HZ if not self.is_behind else 0.0)
+                updates = self._updates()
+                for content in updates:  # waits until the page has received it, or for a minute at most
+                    await asyncio.wait_for(self._page.send_str(content), _SEND_TIMEOUT_S)
+                self.is_behind = bool(updates)
+                await asyncio.sleep(0.0 if updates else 1 / RATE_HZ)
         finally:  # the page may connect again
             with suppress(Exception):
                 await asyncio.wait_for(self._page.close(), _CLOSE_S / 2)
@@ -206,22 +208,12 @@ class _PageStream:
             if not task.cancelled():
                 task.exception()  # a page that has gone is no error
 
-    @property
-    def is_behind(self) -> bool:
-        """Whether there is something that the page has not been sent."""
-        if self._history.info[1] is None:
-            return False
-        if self._history.since(self._next, 1)[1] or self._history.state != self._state:
-            return True
-        return bool(self._chosen and self._history.since(self._next_belief, 1)[1])
-
-    async def _send(self, text: str) -> None:
-        """Wait until the page has received it, or for a minute at most."""
-        await asyncio.wait_for(self._page.send_str(text), _SEND_TIMEOUT_S)
-
     def _updates(self) -> list[str]:
         history = self._history
         updates: list[str] = []
+        if self.answer:
+            updates.append(json.dumps({"kind": "answer", "text": self.answer}))
+            self.answer = ""
         if (vehicles := history.vehicles) is not self._vehicles and vehicles is not None:
             self._vehicles = vehicles
             updates.append(json.dumps({"kind": "vehicles", "rows": vehicles.rows, "answer": vehicles.answer}))
