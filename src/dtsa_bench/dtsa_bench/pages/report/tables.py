@@ -111,7 +111,7 @@ def write_league(table: LeagueTable, directory: Path, command: str = "") -> Path
         for entry in table.entries
     ]
     sections = [
-        Part(heads=HEADS, rows=table.lines()),
+        Part("Results", heads=HEADS, rows=table.lines()),
         _figure(save(league_scores(table), directory / "figures", "scores"), _SCORES),
         Part("Cells", heads=("cell", "what it is"), rows=[(name, league.cells[name]["text"]) for name in table.cells]),
         Part("Ages", _CELLS, heads=("scheme", *table.cells), rows=table.cell_lines()),
