@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from bag_helpers import flight_bag
 from browser_helpers import CHROMIUM, MISSING, Browser, browsing, colours
+from page_helpers import check_loads_nothing
 from view_helpers import numbers
 
 from dtsa_agent.core import REASONS
@@ -187,14 +188,9 @@ def hostile(data: dict[str, Any]) -> dict[str, Any]:
 
 def test_the_page_fetches_nothing_and_names_and_settings_cannot_break_out(data, hostile):
     for page in (render([data["clean"], data["lossy"]]), render([hostile])):
-        shown = re.sub(r"<script.*?</script>", "", page, flags=re.S)
-        assert not re.search(r"<(link|img|iframe|object|embed|base)\b|<[^>]* (src|href|srcset|data)=", shown)
-        assert page.count("</script>") == 2
+        check_loads_nothing(page)
         addresses = set(re.findall(r"https?://[^\s\"'<>)]+", page)) - {"http://www.w3.org/2000/svg"}
         assert addresses == set()
-        assert "@import" not in page
-        assert not re.search(r"url\((?!#|data:)", page)
-        assert "default-src 'none'" in page
 
 
 def test_data_in_the_page_is_the_data(data: dict[str, Any]) -> None:
