@@ -24,18 +24,19 @@ COMPILE_FLAGS = [
     "-Wno-psabi",  # vectors are passed between inlined functions only
 ]
 
-LIBRARY, SIMULATOR = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim"
+LIBRARY, SIMULATOR, SOCKETS = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/air/udp"
 # What Python sees of both: all that these headers declare, in the order in which they include each other.
 HEADERS = [
     f"{LIBRARY}/{name}.h" for name in ("include/dtsa", "include/dtsa_station", "frame", "core", "avoider/avoider")
 ]
 HEADERS += [f"{SIMULATOR}/{name}.h" for name in ("vehicle", "swarm", "metrics", "live")]
+HEADERS += [f"{SOCKETS}/socket_reader.h"]
 # What C calls in Python: an agent behind a station, and what is told of it (core/station.py).
 CALLBACKS = "dtsa_agent/core/callbacks.h"
 
 
-def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR)) -> list[str]:
-    """Sources of the compiled core with a suffix: one agent, many agents."""
+def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR, SOCKETS)) -> list[str]:
+    """Sources of the compiled part with a suffix: one agent, many agents, what reads from a socket."""
     return [path for folder in folders for path in sorted(glob(f"{folder}/**/*{suffix}", recursive=True))]
 
 
@@ -64,7 +65,7 @@ setup(
             "dtsa_agent.core._kernel",
             sources=[binding(), *files(".c")],
             depends=[*files(".h"), "setup.py"],
-            include_dirs=[f"{LIBRARY}/include", f"{LIBRARY}/avoider", LIBRARY, SIMULATOR],
+            include_dirs=[f"{LIBRARY}/include", f"{LIBRARY}/avoider", LIBRARY, SIMULATOR, SOCKETS],
             extra_compile_args=COMPILE_FLAGS,
             py_limited_api=True,  # cffi's code says so, too: one compiled file for Python 3.10 and later
             libraries=["m"],

@@ -30,8 +30,8 @@ from dtsa_bench.log.merge.merge import Merge, verified
 from dtsa_bench.log.merged_bag import MergedFlight, align, write_merged
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.network.sniffer import Sniffer
+from dtsa_bench.pages.view.history import MAX_MOMENTS, RunHistory
 from dtsa_bench.pages.view.network_listener import NetworkListener
-from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
 
 _PATIENCE_S = 60.0
 Own = Callable[[int], dict[str, Any]]  # settings of an agent, by its id
@@ -179,12 +179,12 @@ def hear_each_other(agents: Sequence[Flying], frames: int) -> None:
 @contextmanager
 def listening(config: SwarmConfig, settings: PortSettings) -> Iterator[Callable[[], list[dict[str, Any]]]]:
     """A page's listener; what is given are the moments that it has told so far."""
-    track = Track("listener")
-    source = NetworkListener(track, config, settings)
+    history = RunHistory("listener")
+    source = NetworkListener(history, config, settings)
     thread = threading.Thread(target=source.run)
     thread.start()
     try:
-        yield lambda: [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
+        yield lambda: [json.loads(moment.text) for moment in history.since(0, MAX_MOMENTS)[1]]
     finally:
         source.stopped = True
         thread.join()

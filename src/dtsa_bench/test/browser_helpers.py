@@ -78,7 +78,7 @@ def colours(picture: bytes, directory: Path) -> int:
 
 
 @contextmanager
-def browsing() -> Iterator[Browser]:
+def browsing(width: int = 1400) -> Iterator[Browser]:
     """A browser with one page, for as long as the context lasts."""
     from playwright.sync_api import sync_playwright  # not needed to know that there is no browser
 
@@ -87,7 +87,7 @@ def browsing() -> Iterator[Browser]:
             executable_path=CHROMIUM, args=_OPTIONS, chromium_sandbox=False, timeout=1000.0 * PATIENCE_S
         )
         with browser:
-            page = browser.new_page(viewport={"width": 1400, "height": 1000})
+            page = browser.new_page(viewport={"width": width, "height": 1000})
             page.set_default_timeout(1000.0 * PATIENCE_S)
             yield Browser(page)
 

@@ -20,7 +20,7 @@ from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.record import SLOT_RECORD
 from dtsa_bench.pages.view.follower import Follower
-from dtsa_bench.pages.view.track import Track
+from dtsa_bench.pages.view.history import RunHistory
 
 SLOTS, AGENTS = 150, 6
 PATIENCE_S = 60.0
@@ -32,12 +32,12 @@ def lossy_bag(directory: Path) -> Path:
     return bag
 
 
-def track_of(bag: Path) -> Track:
+def history_of(bag: Path) -> RunHistory:
     """All of a lockstep bag, as a page gets it from the ROS graph while it is flown."""
-    track = Track("lossy")
-    follower = Follower(track, {})
+    history = RunHistory("lossy")
+    follower = Follower(history, {})
     with Bag(bag) as opened:
-        follower.begin(opened.config)
+        follower.start(opened.config)
         for _, record in opened.typed([SLOT_RECORD]):
             if not len(record.chosen):  # where all are at the end
                 continue
@@ -47,7 +47,7 @@ def track_of(bag: Path) -> Track:
             follower.receive("Reception", record)
     follower.finish("recorded")
     assert not follower.unusable
-    return track
+    return history
 
 
 def markers_of(answer: Any) -> SimpleNamespace:
@@ -98,10 +98,10 @@ def viewed_flight(out: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str
 
 
 @contextmanager
-def on_graph(track: Track, domain: int) -> Iterator[Any]:
+def on_graph(history: RunHistory, domain: int) -> Iterator[Any]:
     from dtsa_bench.pages.view.graph import GraphSource  # needs ROS
 
-    source = GraphSource(track, domain, control=True)
+    source = GraphSource(history, domain, control=True)
     listening = threading.Thread(target=source.run, daemon=True)
     listening.start()
     try:

@@ -11,8 +11,9 @@ from contextlib import suppress
 from typing import Generic, Protocol, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.station import Station
 
-from .port import PortProperties, ReceivedDatagram
+from .port import ClockMap, PortProperties, ReceivedDatagram
 
 _END_S = 2.0  # a device that hangs ends with the process
 _ROOM = 256  # datagrams that wait for the agent
@@ -121,6 +122,14 @@ class DevicePort(ABC, Generic[D]):
         if self._arrived:
             os.eventfd_write(self._event, 1)
         return found
+
+    def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
+        """Hand what has arrived, but for its own, to a station; returns how many datagrams have, so many at most."""
+        found = self.receive(most)
+        for one in found:
+            if not one.own:
+                station.receive(one.data, clock.local_ns(one.arrival_ns))
+        return len(found)
 
     def _put(self, data: bytes, arrival_ns: int, own: bool) -> None:
         """The thread that reads has found a datagram."""

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.frame import condition_in
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, Station, StationSettings, check_joinable
@@ -24,7 +23,7 @@ from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.stop import Stop
 
 from .datagram import check_fits, late_in, link_of
-from .port import DatagramPort
+from .port import ClockMap, DatagramPort
 from .process import going_first, wake_precisely
 from .record import Heard, SlotRecord, Watcher
 from .reports import Reports
@@ -32,35 +31,11 @@ from .settings import AgentSettings
 from .tally import Tally
 from .vehicle import SimulatedVehicle, Vehicle
 
-_SECOND = _PPB = 1_000_000_000
+_SECOND = 1_000_000_000
 _SIGNAL_POLL_S = 0.05  # a signal is noticed after this time at the latest
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
-_LOOK_NS = 40_000_000  # from one look at the station's status to the next
+_LOOK_NS = 100_000_000  # from one look at the station's status to the next
 _BURST = 16  # datagrams that are read at a time: whatever comes, the own slots go on
-
-
-class ClockMap:
-    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift.
-
-    :param offset_ns: by how much it is ahead when it is made.
-    :param drift_ppb: parts per billion by which it runs fast.
-    :param began_ns: when it is ahead by the offset, in place of now.
-    """
-
-    __slots__ = ("_began", "_drift", "_offset")
-
-    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0, began_ns: int | None = None) -> None:
-        self._began = time.monotonic_ns() if began_ns is None else began_ns
-        self._offset, self._drift = offset_ns, drift_ppb
-
-    def local_ns(self, monotonic_ns: int) -> int:
-        """What the clock shows at a time of CLOCK_MONOTONIC."""
-        return monotonic_ns + self._offset + (monotonic_ns - self._began) * self._drift // _PPB
-
-    def monotonic_ns(self, local_ns: int) -> int:
-        """The first ns of CLOCK_MONOTONIC at which the clock shows a time, or is past it."""
-        elapsed = local_ns - self._offset - self._began
-        return self._began + elapsed - elapsed * self._drift // (_PPB + self._drift)
 
 
 class LiveAgent:
@@ -96,16 +71,16 @@ class LiveAgent:
         self._settings = StationSettings(config, link, authenticator(config), own.id, own.quorum)
         self.swarm = make_swarm(config, local=[own.id])
         self.clock = ClockMap(own.clock_offset_ns, own.clock_drift_ppb)
+        self._layout = port.properties.header(config.auth) if port.properties.varies else None
+        self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.station = self._start()
         self.slot = -1  # the present slot
         self.tally = Tally()
-        self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         port.say = say
         self._reports = Reports(own.id, config.slot_ms, say, time.monotonic_ns(), show)
         self._next_look_ns = 0
         self._flight_ns = link.flight_ns
-        self._layout = port.properties.header(config.auth) if port.properties.varies else None
-        self._says_leaving, self._frame_length = config.policy_row.says_leaving, config.frame_length
+        self._says_leaving = config.policy_row.says_leaving
         self._record: SlotRecord | None = None  # of the present slot
         self._before: list[Heard] = []  # heard after it began anew and before its first slot
         self._no_priority = ""  # why it has none
@@ -114,7 +89,9 @@ class LiveAgent:
 
     def _start(self) -> Station:
         now = self.clock.local_ns(time.monotonic_ns())
-        return Station(self.swarm, self._settings, now, lambda slot: self._vehicle.sense(self.swarm), self)
+        sense = None if isinstance(self._vehicle, SimulatedVehicle) else lambda slot: self._vehicle.sense(self.swarm)
+        every_frame = self.watcher is not None or self._layout is not None
+        return Station(self.swarm, self._settings, now, sense, self, every_frame)
 
     # The loop.
 
@@ -137,14 +114,12 @@ class LiveAgent:
                 return
             time.sleep(_SIGNAL_POLL_S)
         station = self.station = self._start()
-        local, receive, step, descriptor = self.clock.local_ns, self.port.receive, station.step, [self.port.fileno()]
-        now = began
+        clock, port, step, now = self.clock, self.port, station.step, began
+        local, deliver, descriptor = clock.local_ns, port.deliver, [port.fileno()]
         while not ((stop.signal or (end is not None and now >= end)) and self._has_ended(stop, end)):
-            arrived = receive(_BURST)
-            for data, arrival_ns, own in arrived:
-                if not own:
-                    station.receive(data, local(arrival_ns))
-            while True:
+            count = deliver(station, clock, _BURST)
+            due = shown = -1
+            while due <= shown:
                 now = time.monotonic_ns()
                 shown = local(now)
                 due, datagram = step(shown)
@@ -152,16 +127,16 @@ class LiveAgent:
                     self._send(datagram, shown)
                 elif station.slot != self.slot:
                     self._fly(station.slot, now)
-                elif due > shown:
-                    break
-            if len(arrived) == _BURST:
+            if count == _BURST:
                 continue
             if self.slot < 0:
                 self._reports.state("listens for others", now)
-            left = min((self.clock.monotonic_ns(due) - time.monotonic_ns()) / 1e9, _SIGNAL_POLL_S)
-            if left > 0 and station.awaits_frame(shown):
+            left = min((clock.monotonic_ns(due) - time.monotonic_ns()) / 1e9, _SIGNAL_POLL_S)
+            if left <= 0:
+                continue
+            if station.awaits_frame(shown):
                 select.select(descriptor, (), (), left)
-            elif left > 0:  # one wake-up a slot: datagrams wait in the port, which has noted when they arrived
+            else:  # one wake-up a slot: datagrams wait in the port, which has noted when they arrived
                 time.sleep(left)
         self._close_record()
 
@@ -231,12 +206,9 @@ class LiveAgent:
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         """Count and record a frame."""
-        if accepted:
-            frame = datagram[-self._frame_length :]
-            self.tally.hear(sender, slot, self._says_leaving and condition_in(frame)[0])
-            if self._layout is not None:
-                start, late = self.station.slot_start_ns(slot), late_in(datagram, self._layout)
-                self.tally.off(arrival_ns - start - self._flight_ns - late)
+        if accepted and self._layout is not None:
+            start, late = self.station.slot_start_ns(slot), late_in(datagram, self._layout)
+            self.tally.off(arrival_ns - start - self._flight_ns - late)
         if self.watcher is not None:
             heard = Heard(sender, slot, arrival_ns, datagram, accepted)
             (self._before if self._record is None else self._record.heard).append(heard)
@@ -265,7 +237,7 @@ class LiveAgent:
             "sealed": self.config.auth,
             "no_priority": self._no_priority,
             "quorum": self.own.quorum,
-            **self.tally.summary(self.slot, self.station.status),
+            **self.tally.summary(self.station.status, self.station.longest_gap()),
             "slots_too_short": self._reports.slots_too_short,
             "heard_of": sorted(int(k) + 1 for k in np.flatnonzero(swarm.sent_slot[0] >= 0) if k + 1 != self.own.id),
             "not_taken_in": dict(sorted(refused.items())),

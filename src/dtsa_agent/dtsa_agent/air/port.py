@@ -2,9 +2,38 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
+
+from dtsa_agent.core.station import Station
+
+_SECOND = 1_000_000_000
+
+
+class ClockMap:
+    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift.
+
+    :param offset_ns: by how much it is ahead when it is made.
+    :param drift_ppb: parts per billion by which it runs fast.
+    :param began_ns: when it is ahead by the offset, in place of now.
+    """
+
+    __slots__ = ("began_ns", "drift_ppb", "offset_ns")
+
+    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0, began_ns: int | None = None) -> None:
+        self.began_ns = time.monotonic_ns() if began_ns is None else began_ns
+        self.offset_ns, self.drift_ppb = offset_ns, drift_ppb
+
+    def local_ns(self, monotonic_ns: int) -> int:
+        """What the clock shows at a time of CLOCK_MONOTONIC."""
+        return monotonic_ns + self.offset_ns + (monotonic_ns - self.began_ns) * self.drift_ppb // _SECOND
+
+    def monotonic_ns(self, local_ns: int) -> int:
+        """The first ns of CLOCK_MONOTONIC at which the clock shows a time, or is past it."""
+        elapsed = local_ns - self.offset_ns - self.began_ns
+        return self.began_ns + elapsed - elapsed * self.drift_ppb // (_SECOND + self.drift_ppb)
 
 
 class Header(NamedTuple):
@@ -80,6 +109,9 @@ class DatagramPort(Listener, Protocol):
 
     def send(self, data: bytes) -> str:
         """Send a datagram at once; returns why the port has not taken it, or an empty text."""
+
+    def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
+        """Hand what has arrived, but for its own, to a station; returns how many datagrams have, so many at most."""
 
     def __enter__(self) -> DatagramPort: ...
 

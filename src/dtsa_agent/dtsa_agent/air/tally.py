@@ -26,28 +26,14 @@ class Tally:
         self.flew = False
         self._joined_s = 0.0  # processor time until then
         self._others = self._hears = 0  # agents that are there, and those heard of them, over all looks
-        self._last: dict[int, int] = {}  # slot of the last frame, by sender
-        self._oldest, self._oldest_of = 0, 0  # slots, and of which agent
         self._late = Delays()  # frames sent, by how late they left
         self._off: Delays | None = None  # frames heard, by how far off they arrived
         self._on_time = 0
 
     def begun(self, slot: int) -> None:
-        """It begins, or restarts: who was heard before counts as not heard yet."""
+        """It begins, or restarts."""
         if self.first_slot < 0:
             self.first_slot, self.joined_ns, self._joined_s = slot, time.monotonic_ns(), _processor_s()
-        self._last.clear()
-
-    def hear(self, sender: int, slot: int, leaves: bool) -> None:
-        """A frame was accepted; the silence of an agent that leaves is no outage."""
-        self._note_age(sender, slot - self._last.get(sender, slot))
-        self._last[sender] = slot
-        if leaves:
-            del self._last[sender]
-
-    def _note_age(self, sender: int, age: int) -> None:
-        if age > self._oldest and self._others:
-            self._oldest, self._oldest_of = age, sender
 
     def look(self, others: int, hears: int) -> None:
         """How it stands with the others while it flies, or could."""
@@ -64,14 +50,12 @@ class Tally:
         self._off = self._off or Delays()
         self._off.add(abs(off_ns))
 
-    def summary(self, slot: int, status: Any) -> dict[str, Any]:
+    def summary(self, status: Any, longest_gap: tuple[int, int]) -> dict[str, Any]:
         """The counts as plain values.
 
-        :param slot: the present one.
         :param status: a ``dtsa_station_status``.
+        :param longest_gap: how long it has waited for an agent, slots, and for which.
         """
-        for sender, last in self._last.items():
-            self._note_age(sender, slot - last)
         used, ended = _processor_s(), self.ended_ns or time.monotonic_ns()
         late = status.unsent - self.unsent.total()
         unsent = self.unsent + Counter({TOO_LATE: max(0, late)})
@@ -89,8 +73,8 @@ class Tally:
             "heard": status.heard,
             **({} if self._off is None else {"arrivals_off_ms": _quantiles(self._off)}),
             "heard_share": self._hears / self._others if self._others else None,
-            "oldest_heard_slots": self._oldest if self._others else None,
-            "oldest_heard_of": self._oldest_of or None,
+            "oldest_heard_slots": longest_gap[0] if self._others else None,
+            "oldest_heard_of": longest_gap[1] or None,
             "processor_s": used,
             "processor_us_per_slot": (used - self._joined_s) / status.slots * 1e6 if status.slots else None,
             "memory_mb": _memory_mb(),

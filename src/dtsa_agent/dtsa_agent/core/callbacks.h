@@ -1,4 +1,5 @@
 /* What C calls in Python (core/station.py); the context is a handle of a Station. */
+void station_prepare(void *context, int64_t slot, int hovers);
 int station_open(void *context, int64_t slot, int hovers, uint8_t *frame, int *chosen);
 int station_hear(void *context, int64_t slot, const uint8_t *frame, long length);
 void station_unsent(void *context);

@@ -222,6 +222,7 @@ class Station:
     :param now_ns: when it begins to listen.
     :param before_slot: is called before the agent decides for a slot; writes its state.
     :param events: is told what happens.
+    :param every_frame: also of each slot and each frame that is heard.
     """
 
     def __init__(
@@ -231,10 +232,11 @@ class Station:
         now_ns: int,
         before_slot: Callable[[int], None] | None = None,
         events: Events | None = None,
+        every_frame: bool = True,
     ) -> None:
         self.swarm, self._settings, self._before, self.events = swarm, settings, before_slot, events
         self.fault: BaseException | None = None  # raised in a callback; the caller of C raises it again
-        self._flies = swarm.scenario.moving[swarm.local] if swarm.course is None else None
+        self._moves = bool(swarm.scenario.moving[swarm.local[0]])
         self._probation = swarm.config.policy_row.probation
         self._handle = ffi.new_handle(self)
         size = lib.dtsa_station_bytes(settings.c)
@@ -243,36 +245,40 @@ class Station:
         if not self.c:
             raise ValueError("a station cannot be made of these settings")
         if events is not None:
-            lib.dtsa_station_observe(self.c, self._observer())
+            lib.dtsa_station_observe(self.c, self._observer(every_frame))
         self._out = ffi.new("uint8_t[]", lib.DTSA_DATAGRAM_MAX)
         self._buffer, self._length = ffi.buffer(self._out), ffi.new("int *")
         self._status = ffi.new("dtsa_station_status *")
         self._receive, self._step = lib.dtsa_station_receive, lib.dtsa_station_step
 
     def _agent(self) -> Any:
-        return ffi.new("dtsa_station_agent *", [
-            self._handle, lib.station_open, lib.station_hear, lib.station_unsent, lib.station_close,
-            lib.station_restart, lib.station_leave, lib.station_on_probation,
-        ])  # fmt: skip
+        swarm = self.swarm
+        if not swarm.all_in_c or swarm.authenticator is not None:
+            return ffi.new("dtsa_station_agent *", [
+                self._handle, lib.station_open, lib.station_hear, lib.station_unsent, lib.station_close,
+                lib.station_restart, lib.station_leave, lib.station_on_probation,
+            ])  # fmt: skip
+        is_prepared = self._before is not None or swarm.course is not None
+        prepare = lib.station_prepare if is_prepared else ffi.NULL
+        self._pilot = ffi.new("swarm_pilot *", [swarm.kernel, self._moves, self._handle, prepare])
+        return ffi.new("dtsa_station_agent *", lib.swarm_station_agent(self._pilot))
 
-    def _observer(self) -> Any:
+    def _observer(self, every_frame: bool) -> Any:
+        opened, heard = (lib.station_opened, lib.station_heard) if every_frame else (ffi.NULL, ffi.NULL)
         return ffi.new("dtsa_station_events *", [
-            self._handle, lib.station_opened, lib.station_restarted, ffi.NULL, lib.station_heard,
-            lib.station_refused,
+            self._handle, opened, lib.station_restarted, ffi.NULL, heard, lib.station_refused,
         ])  # fmt: skip
 
     def receive(self, data: bytes, arrival_ns: int) -> int:
         """Hand in a datagram, whatever it is, in the order of arrival; returns an index into ``VERDICTS``."""
         verdict: int = self._receive(self.c, data, len(data), arrival_ns)
-        if self.fault is not None:
-            self._raise()
+        self.raise_fault()
         return verdict
 
     def step(self, now_ns: int) -> tuple[int, bytes]:
-        """Do one thing that is due. Returns when to call again at the latest (now: at once), and what to send now."""
+        """Do one thing that is due. Returns when to call again (not after now: at once), and what to send now."""
         due: int = self._step(self.c, now_ns, self._out, self._length)
-        if self.fault is not None:
-            self._raise()
+        self.raise_fault()
         length = self._length[0]
         return due, self._buffer[:length] if length else b""
 
@@ -297,6 +303,11 @@ class Station:
         """When a slot starts; it may still move a little with what is heard."""
         return int(lib.dtsa_station_slot_start(self.c, slot))
 
+    def longest_gap(self) -> tuple[int, int]:
+        """The longest that it has waited for a frame of an agent that it had heard, slots, and that agent's id."""
+        agent = ffi.new("int *")
+        return int(lib.dtsa_station_longest_gap(self.c, agent)), agent[0]
+
     @property
     def status(self) -> Any:
         """A ``dtsa_station_status``, good until it is asked for again."""
@@ -308,22 +319,26 @@ class Station:
         """Why the agent hovers in the present slot; ``FLIES``: it does not."""
         return int(lib.dtsa_station_hovers(self.c))
 
-    def _raise(self) -> None:
-        fault, self.fault = self.fault, None
-        assert fault is not None
-        raise fault
+    def raise_fault(self) -> None:
+        """Raise what a callback has raised."""
+        if self.fault is not None:
+            fault, self.fault = self.fault, None
+            raise fault
 
     # What C calls.
 
-    def open(self, slot: int, hovers: int, frame: Any, chosen: Any) -> int:
+    def prepare(self, slot: int, hovers: int) -> None:
         swarm = self.swarm
         if self._before is not None:
             self._before(slot)
-        if self._flies is not None:
-            swarm.active[:] = self._flies
+        swarm.active[0] = self._moves
         swarm.scenario.advance(slot, swarm)
         if hovers:
             swarm.active[0] = 0
+
+    def open(self, slot: int, hovers: int, frame: Any, chosen: Any) -> int:
+        swarm = self.swarm
+        self.prepare(slot, hovers)
         sends = swarm.begin(slot)
         chosen[0] = swarm.chosen[0]
         if not sends:
@@ -364,6 +379,7 @@ def _bytes(data: Any, length: int) -> bytes:
     return bytes(ffi.buffer(data, length))
 
 
+_callback(Station.prepare, "station_prepare")
 _callback(Station.open, "station_open")
 _callback(lambda s, slot, data, n: s.swarm.hear(slot, _bytes(data, n)), "station_hear")
 _callback(lambda s: s.swarm.drop(0), "station_unsent")

@@ -62,7 +62,7 @@ class Swarm:
     :raises ConfigError: for ids that do not exist, or settings that need agents that are not here.
     """
 
-    _all_in_c = True  # no step is overridden
+    all_in_c = True  # no step is overridden
 
     # What C borrows, by the names in ``swarm`` (libdtsa_sim/swarm.h). Letters of shapes: n agents, v tables, l local
     # agents, s control instants, f bytes of a frame, p bytes of a policy's state.
@@ -205,7 +205,7 @@ class Swarm:
         :param senders: as :meth:`begin` gave them.
         :param heard: (F, V) which tables hear each frame; None: ``all_hear``, or none does.
         """
-        if self._all_in_c and self.authenticator is None:
+        if self.all_in_c and self.authenticator is None:
             tables = _NULL if heard is None else heard.tobytes()
             if heard is not None and heard.shape != (len(senders), len(self.observer)):
                 raise ValueError(f"heard: shape {heard.shape}")

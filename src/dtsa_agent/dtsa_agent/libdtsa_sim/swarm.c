@@ -277,3 +277,51 @@ void swarm_complete(swarm *s, int64_t slot, int all, const uint8_t *heard)
     }
     swarm_end(s, slot);
 }
+
+/* ---- its only local agent behind a station ---- */
+
+static swarm *piloted(void *context) { return ((swarm_pilot *)context)->swarm; }
+
+static int pilot_open(void *context, int64_t slot, int hovers, uint8_t frame[DTSA_DATAGRAM_MAX],
+                      int *chosen)
+{
+    const swarm_pilot *pilot = context;
+    swarm *s = pilot->swarm;
+    if (pilot->prepare)
+        pilot->prepare(pilot->context, slot, hovers);
+    else
+        s->active[0] = pilot->moves && !hovers;
+    const int sends = swarm_begin(s, slot);
+    *chosen = s->chosen[0];
+    if (!sends) return 0;
+    memcpy(frame, s->frames, s->frame_length[0]);
+    return s->frame_length[0];
+}
+
+static int pilot_hear(void *context, int64_t slot, const uint8_t *frame, long length)
+{
+    return swarm_hear(piloted(context), slot, frame, length, NULL);
+}
+
+static void pilot_unsent(void *context) { piloted(context)->frame_length[0] = 0; }
+static void pilot_close(void *context, int64_t slot) { swarm_end(piloted(context), slot); }
+static void pilot_restart(void *context) { swarm_restart(piloted(context), 0); }
+
+static int pilot_leave(void *context)
+{
+    swarm *s = piloted(context);
+    const int says = policy_of(s->config.policy)->says_leaving;
+    s->present[0] = says ? PRESENT_LEAVING : 0;
+    return says;
+}
+
+static int pilot_on_probation(void *context)
+{
+    return dtsa_agent_status(piloted(context)->agents).probation;
+}
+
+dtsa_station_agent swarm_station_agent(swarm_pilot *pilot)
+{
+    return (dtsa_station_agent){pilot,       pilot_open,    pilot_hear,  pilot_unsent,
+                                pilot_close, pilot_restart, pilot_leave, pilot_on_probation};
+}

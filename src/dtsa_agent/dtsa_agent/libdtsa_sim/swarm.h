@@ -4,6 +4,7 @@
 #define DTSA_SWARM_H
 
 #include "core.h"
+#include "dtsa_station.h"
 #include "policy/policy.h"
 #include "vehicle.h"
 
@@ -67,5 +68,16 @@ void swarm_fly(swarm *s, int64_t slot);
 /* The rest of a slot whose frames are the swarm's own: fly, hear, end. heard (senders, v): which
  * tables hear each; NULL: `all` of them, or none. */
 void swarm_complete(swarm *s, int64_t slot, int all, const uint8_t *heard);
+
+/* The only local agent of a swarm behind a station. */
+typedef struct swarm_pilot {
+    swarm *swarm;
+    int moves; /* it flies unless the station says that it hovers; where nothing is prepared */
+    void *context;
+    /* Before it decides for a slot: writes its state, goal and activity. NULL: they stay as they are. */
+    void (*prepare)(void *context, int64_t slot, int hovers);
+} swarm_pilot;
+/* Its pilot is the context, and has to stay. */
+dtsa_station_agent swarm_station_agent(swarm_pilot *pilot);
 
 #endif

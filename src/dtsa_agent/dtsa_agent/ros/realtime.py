@@ -39,7 +39,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from dtsa_agent.air.driver import ClockMap
+from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.agents.agent import REFUSED
 from dtsa_agent.core.authentication import Authenticator

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from dtsa_agent.air.driver import ClockMap
+from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator

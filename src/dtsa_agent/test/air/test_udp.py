@@ -18,17 +18,17 @@ from unittest.mock import DEFAULT, MagicMock
 import pytest
 
 from dtsa_agent.air.datagram import link_of
-from dtsa_agent.air.driver import ClockMap, LiveAgent
-from dtsa_agent.air.port import ReceivedDatagram
+from dtsa_agent.air.driver import LiveAgent
+from dtsa_agent.air.port import ClockMap, ReceivedDatagram
 from dtsa_agent.air.process import going_first
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.reports import Reports
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.tally import Tally
 from dtsa_agent.air.udp import UdpPort, UdpSettings
-from dtsa_agent.air.udp.port import StampClock
 from dtsa_agent.core import ConfigError, Frame, Swarm, SwarmConfig, encode_frame
 from dtsa_agent.core.authentication import Authenticator
+from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.station import BETWEEN, FLIES, Station, StationSettings
 from dtsa_agent.stop import Stop
 
@@ -95,50 +95,39 @@ def test_a_bent_clock_is_read_both_ways(drift: int) -> None:
     assert clock.local_ns(now + hour) - clock.local_ns(now) == pytest.approx(hour + hour * drift / 1e9, abs=2)
 
 
-def test_stamps_of_a_clock_that_has_been_set_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
-    ahead = [10**18]
-    monkeypatch.setattr(time, "time_ns", lambda: time.monotonic_ns() + ahead[0])
-    stamps = StampClock()
-    stamps.look()
-    arrived = time.monotonic_ns() - 2_000_000
-    assert abs(stamps.arrival_ns(arrived + ahead[0]) - arrived) < 500_000
-    ahead[0] += 3600 * 10**9  # somebody sets the clock
-    before = time.monotonic_ns()
-    stamps.look()
-    assert stamps.steps == 1
-    assert before <= stamps.arrival_ns(arrived + 10**18) <= time.monotonic_ns()
-    before = time.monotonic_ns()
-    stamps.look()  # from now on stamps are of the new time
-    assert abs(stamps.arrival_ns(arrived + ahead[0]) - arrived) < 500_000
-    assert before <= stamps.arrival_ns(0) <= time.monotonic_ns()
-    assert before <= stamps.arrival_ns(None) <= time.monotonic_ns()
+def test_stamps_of_a_clock_that_has_been_set_are_not_believed() -> None:
+    reader, ahead, second = ffi.new("socket_reader *"), 10**18, 10**9
+    lib.socket_look(reader, ahead, 5 * second)
+    lib.socket_look(reader, ahead + 1_000, 6 * second)
+    arrived = 6 * second - 2_000_000
+    assert lib.socket_arrival(reader, arrived + ahead + 1_000) == arrived
+    steps = reader.clock_steps
+    ahead += 3600 * second  # somebody sets the clock
+    lib.socket_look(reader, ahead, 7 * second)
+    assert reader.clock_steps == steps + 1
+    for stamp in (arrived + ahead, arrived + 10**18):
+        assert lib.socket_arrival(reader, stamp) == 7 * second
+    lib.socket_look(reader, ahead, 8 * second)  # from now on stamps are of the new time
+    assert lib.socket_arrival(reader, 8 * second - 5 + ahead) == 8 * second - 5
+    for stamp in (0, -1, 8 * second + 1 + ahead, 2**62):
+        assert lib.socket_arrival(reader, stamp) == 8 * second
 
 
-def test_arrivals_are_exact_however_long_a_process_was_kept_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It stands still between two datagrams of one pass: the second one has arrived long after the first was read."""
+def test_arrivals_are_exact_however_long_a_process_was_kept_waiting() -> None:
+    """It stands still between two datagrams of one pass: the second one has arrived long after the first."""
     with UdpPort(UdpSettings(interface="lo", group=f"239.255.77.77:{20_000 + os.getpid() % 10_000}")) as end:
         sent = []
-        look = StampClock.look
-
-        def send() -> None:
+        for _ in range(2):
             sent.append(time.monotonic_ns())
             end.send(b"x")
-
-        def stand_still(stamps: StampClock) -> None:
-            look(stamps)
-            if len(sent) == 1:
-                time.sleep(0.05)
-                send()
-
-        monkeypatch.setattr(StampClock, "look", stand_still)
-        send()
+            time.sleep(0.05)
         found: list[ReceivedDatagram] = []
         while len(found) < 2:
             assert time.monotonic_ns() - sent[0] < 10 * 10**9
             found += end.receive(16)
     first, second = (datagram.arrival_ns for datagram in found)
     assert sent[0] <= first < sent[1] - 40_000_000  # before it stood still
-    assert sent[1] <= second
+    assert sent[1] <= second < time.monotonic_ns() - 40_000_000
 
 
 #: Of a station that has done nothing yet.
@@ -149,10 +138,10 @@ STATUS = SimpleNamespace(
 
 def test_the_tally_knows_how_late_frames_left() -> None:
     tally = Tally()
-    assert tally.summary(-1, STATUS)["sends_on_time_share"] is None
+    assert tally.summary(STATUS, (0, 0))["sends_on_time_share"] is None
     for late in (0, 50_000, 60_000, 3_000_000):
         tally.sent(late)
-    found = tally.summary(-1, SimpleNamespace(**vars(STATUS) | {"sent": 4}))
+    found = tally.summary(SimpleNamespace(**vars(STATUS) | {"sent": 4}), (0, 0))
     assert found["sends_on_time_share"] == 0.75
     assert found["send_late_ms"] == {"p50": pytest.approx(0.05, rel=0.05), "p99": 3.0, "max": 3.0}
 
@@ -242,21 +231,41 @@ def test_an_agent_goes_first_and_what_it_starts_does_not() -> None:
         assert (problem, os.sched_getscheduler(0)) == ("", before)
 
 
-def test_the_tally_shows_an_outage() -> None:
+def test_the_share_of_agents_heard_counts_from_when_it_could_fly() -> None:
     tally = Tally()
-    tally.begun(100)
-    for slot in (101, 140):  # it is new
-        tally.hear(2, slot, leaves=False)
-    found = tally.summary(150, STATUS)
-    assert (found["heard_share"], found["oldest_heard_slots"]) == (None, None)
-    tally.look(2, 2)
-    for slot in range(141, 200, 4):
-        tally.hear(2, slot, leaves=False)
-        tally.hear(3, slot, leaves=False)
-    tally.look(2, 1)
-    tally.hear(3, 260, leaves=True)
-    found = tally.summary(250, STATUS)
+    found = tally.summary(STATUS, (0, 0))
+    assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (None, None, None)
+    for hears in (2, 1):
+        tally.look(2, hears)
+    found = tally.summary(STATUS, (63, 3))
     assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (0.75, 63, 3)
-    found = tally.summary(400, STATUS)
-    assert found["oldest_heard_of"] == 2  # not heard any more; the other one has left
-    assert found["oldest_heard_slots"] == 203
+
+
+def test_the_longest_wait_for_a_frame_is_that_of_an_agent_that_was_heard_and_has_not_left() -> None:
+    config = SwarmConfig(agents=3, policy="lease")
+    settings, others = datagrams(config), {agent: Swarm(config, local=[agent]) for agent in (2, 3)}
+    station = Station(Swarm(config, local=[1]), StationSettings(config, link_of(config), origin_ns=0), 0)
+
+    def step_to(slot: int) -> None:
+        while (due := station.step(slot * SLOT_NS)[0]) <= slot * SLOT_NS or station.slot < slot:
+            assert due <= slot * SLOT_NS
+
+    def hear(sender: int, slot: int) -> None:
+        step_to(slot)
+        swarm = others[sender]
+        swarm.sends[:] = 1
+        swarm.emit(slot)
+        assert station.receive(settings.write(swarm.frame(0), slot), slot * SLOT_NS) == 0
+
+    for slot in (100, 103):
+        hear(2, slot)
+    assert station.longest_gap() == (3, 2)
+    for slot in (104, 160):
+        hear(3, slot)
+    assert station.longest_gap() == (57, 2)
+    hear(2, 162)
+    assert station.longest_gap() == (59, 2)
+    others[2].leave(0)
+    hear(2, 163)
+    step_to(230)
+    assert station.longest_gap() == (70, 3)  # not heard any more; the other one has left

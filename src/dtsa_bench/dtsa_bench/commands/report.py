@@ -9,10 +9,9 @@ from pathlib import Path
 from .registry import RECORDED_RUN
 
 DESCRIPTION = """\
-Writes one self-contained HTML page about one recorded run, or several side by side: the flight in 3D, the
-slots,
-distances, ages, estimate errors, channel use, decisions and the configuration. It opens without a network
-and prints."""
+Writes one self-contained HTML page about one recorded run, or several side by side: the flight in 3D, the slots,
+distances, ages, estimate errors, channel use, decisions and the configuration. It opens without a network, and
+prints."""
 EXAMPLES = (
     ("runs/a", "one run"),
     ("runs/a runs/b --out compared.html", "two side by side"),

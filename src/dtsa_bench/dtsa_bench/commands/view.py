@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Protocol
 
 from .network_options import add_network_options, read_network_options
 
 if TYPE_CHECKING:
-    from dtsa_bench.pages.view.orders import Order
+    from dtsa_bench.pages.view.page_commands import PageCommand
     from dtsa_bench.pages.view.server import ViewServer
-    from dtsa_bench.pages.view.track import Track
 
 DESCRIPTION = """\
 Shows a swarm on a page that this machine alone can open: the swarm on the ROS graph, or (--air) agents on a network or
@@ -25,16 +26,17 @@ EXAMPLES = (
     ("--air udp --interface eth0 --auth-session 41", "agents on a network; the key is in DTSA_AUTH_KEY"),
 )
 _ROS = "ros"
-_LAST_S = 2.0  # for the source to end, and for pages to receive the end of a flight
+_END_S = 2.0  # for the source to end, and for pages to receive the end of a flight
+_NICE = 10  # flights on this machine go first
 
 
 class Source(Protocol):
-    """Hands over a run moment by moment, in a thread of its own."""
+    """Adds the moments of a run to a history, in a thread of its own."""
 
     stopped: bool
 
     def run(self) -> None:
-        """Follow it until it is over, or ``stopped`` is set."""
+        """Follow the run until it is over, or ``stopped`` is set."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve the page until a signal comes."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.pages.view.process import give_way
+    from dtsa_bench.pages.view.history import RunHistory
     from dtsa_bench.pages.view.server import ViewServer, new_token
     from dtsa_bench.runs.options import whole_number
     from dtsa_bench.runs.program import program
@@ -72,32 +74,27 @@ def run(args: argparse.Namespace) -> int:
     port = whole_number(args.port, "port", 0, 65535)
     if args.listen is not None and not _plain_address(args.listen):
         raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
-    give_way()
-    track, source, order = _network(args) if args.swarm_file or args.air not in (None, _ROS) else _graph(args)
-    asyncio.run(_serve(ViewServer(track, new_token(), order), source, port, args.listen))
+    with suppress(OSError):
+        os.nice(_NICE)
+    source: Source
+    command: Callable[[PageCommand], str] | None = None
+    if args.swarm_file or args.air not in (None, _ROS):
+        from dtsa_bench.pages.view.network_listener import NetworkListener
+
+        settings, config = read_network_options(args)
+        history = RunHistory(settings.where)
+        source = NetworkListener(history, config, settings)
+    else:
+        from dtsa_agent.ros.common.graph import names
+        from dtsa_bench.pages.view.graph import GraphSource
+
+        domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
+        space = "/" + args.namespace.strip("/") if args.namespace else names.SWARM
+        history = RunHistory(space)
+        source = graph = GraphSource(history, domain, space, args.control)
+        command = graph.command if args.control else None
+    asyncio.run(_serve(ViewServer(history, new_token(), command), source, port, args.listen))
     return 0
-
-
-def _network(args: argparse.Namespace) -> tuple[Track, Source, None]:
-    from dtsa_bench.pages.view.network_listener import NetworkListener
-    from dtsa_bench.pages.view.track import Track
-
-    port, config = read_network_options(args)
-    track = Track(port.where)
-    return track, NetworkListener(track, config, port), None
-
-
-def _graph(args: argparse.Namespace) -> tuple[Track, Source, Callable[[Order], str] | None]:
-    from dtsa_agent.ros.common.graph import names
-    from dtsa_bench.pages.view.graph import GraphSource
-    from dtsa_bench.pages.view.track import Track
-    from dtsa_bench.runs.options import whole_number
-
-    domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
-    space = "/" + args.namespace.strip("/") if args.namespace else names.SWARM
-    track = Track(space)
-    source = GraphSource(track, domain, space, args.control)
-    return track, source, source.order if args.control else None
 
 
 def _plain_address(text: str) -> bool:
@@ -126,5 +123,5 @@ async def _serve(server: ViewServer, source: Source, port: int, address: str | N
         print("open it in a browser; Ctrl-C ends", file=sys.stderr, flush=True)
     await over.wait()
     source.stopped = True
-    await asyncio.get_running_loop().run_in_executor(None, thread.join, _LAST_S)
-    await server.stop(_LAST_S)
+    await asyncio.get_running_loop().run_in_executor(None, thread.join, _END_S)
+    await server.stop(_END_S)

@@ -124,6 +124,7 @@ def align(merge: Merge, summary: Mapping[str, Any]) -> MergedFlight:
         "residual_us": residual,
         "clocks": summary["time_line"]["clocks"],
         "slot_on_the_first_clock_ns": length,
+        "agents_that_gave_up_a_time": sorted({agent for agent, number in merge.lives if number < 0}),
         "processes": [_describe_process(life, bag) for life, bag in lives.items()],
     }  # fmt: skip
     return MergedFlight(merge.config, first, lives, strays, about)
@@ -211,6 +212,8 @@ def slot_fields(flight: MergedFlight) -> Iterator[tuple[int, dict[str, Any]]]:
             outcome = UNKNOWN
         heard = [(agent, one, early) for agent, record in records.items()
                  for frames_heard, early in ((record.before, 1), (record.heard, 0)) for one in frames_heard]  # fmt: skip
+        # Of a time that its sender gave up: the log has another frame of that slot.
+        other = [_other_frame(one, frames, config) for _, one, _ in heard]
         by = np.zeros((len(heard), config.agents), np.bool_)
         by[np.arange(len(heard)), [agent - 1 for agent, _, _ in heard]] = True
         vectors = {
@@ -230,7 +233,15 @@ def slot_fields(flight: MergedFlight) -> Iterator[tuple[int, dict[str, Any]]]:
             "heard_ns": [one.arrival_ns - start_ns for _, one, _ in heard],
             "heard_by": np.frombuffer(pack_received(by), np.uint8) if heard else [],
             "heard_before": [early for _, _, early in heard] if any(early for _, _, early in heard) else [],
+            "heard_length": [len(data) for data in other] if any(other) else [],
+            "heard_data": np.frombuffer(b"".join(other), np.uint8),
         }  # fmt: skip
+
+
+def _other_frame(heard: Heard, frames: Mapping[int, Mapping[int, tuple[int, bytes]]], config: SwarmConfig) -> bytes:
+    """A frame that was heard, if the log has another one of its sender and slot; else nothing."""
+    data = frame_in(heard.datagram, config)
+    return b"" if frames[heard.slot][heard.sender][1] == data else data
 
 
 def to_log(flight: MergedFlight) -> FlightLog:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ PALETTE = {
     "hovering": palette.HOVERING,
     "series": palette.SERIES,
 }
-SCRIPTS = ("core.js", "plot.js", "scene.js", "slots.js")  # of all pages that play a run
+SCRIPTS = ("page.js", "core.js", "plot.js", "scene.js", "slots.js")  # of all pages that play a run
 
 
 @cache
@@ -45,9 +46,19 @@ def _environment() -> Environment:
     return environment
 
 
-def render_page(template: str, **values: Any) -> str:
-    """A page; all values but those of `Markup` are text, whatever is in them."""
-    return _environment().get_template(template).render(**values)
+def render_page(
+    kind: str, title: str, scripts: Sequence[str], data: Mapping[str, Any], *, styles: Sequence[str] = ("style.css",),
+    served: bool = False, **values: Any,
+) -> str:  # fmt: skip
+    """Return a page; all values but those of `Markup` are text, whatever is in them.
+
+    :param data: what its scripts read, as JSON types.
+    :param served: whether scripts and styles have addresses of their own; else they stand in the page.
+    """
+    return (
+        _environment().get_template("page.html")
+        .render(kind=kind, title=title, scripts=scripts, data=data, styles=styles, served=served, **values)
+    )  # fmt: skip
 
 
 def write_page(path: Path, page: str) -> None:
@@ -72,15 +83,9 @@ def flatten(config: Mapping[str, Any], section: str = "") -> list[list[Any]]:
 
 def reduce_bins(values: NDArray[Any], how: Any) -> NDArray[np.float64]:
     """(BINS or fewer,) from (T,): `how` applied to each of the bins; NaN where a bin holds nothing finite."""
-    count = min(BINS, len(values))
-    edges = np.linspace(0, len(values), count + 1).astype(int)
-    result = np.full(count, np.nan)
-    for index in range(count):
-        part = values[edges[index] : edges[index + 1]]
-        part = part[np.isfinite(part)]
-        if len(part):
-            result[index] = how(part)
-    return result
+    edges = np.linspace(0, len(values), min(BINS, len(values)) + 1).astype(int)
+    parts = (values[first:end][np.isfinite(values[first:end])] for first, end in pairwise(edges))
+    return np.array([how(part) if len(part) else math.nan for part in parts], np.float64)
 
 
 def thin(values: NDArray[Any], digits: int = 4) -> list[float | None]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from typing import Any
 
 import pytest
 from cli_helpers import refused
+from page_helpers import check_loads_nothing
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
@@ -147,7 +147,7 @@ def test_the_table_is_lines_and_a_page(flown: Path, tmp_path: Path, capsys: pyte
     page = (tmp_path / "league.html").read_text()
     assert "Not all cells and seeds were flown" in page
     assert page.count("<svg") == 1
-    assert not re.search(r"<(script|link|img|iframe)|url\(http|@import", page)  # it opens without a network
+    check_loads_nothing(page)
     assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["scores.png", "scores.svg"]
     other = read_entries(flown / "lease")[0]
     with pytest.raises(ConfigError, match="every name once"):

@@ -18,7 +18,7 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import AgentBag, NothingWritten, read
 from dtsa_bench.log.merge.joined import all_known_after
-from dtsa_bench.log.merge.merge import Merge
+from dtsa_bench.log.merge.merge import Merge, count_unmatched_frames
 from dtsa_bench.log.merge.timeline import Crossing, Life, both_ways, fit
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
@@ -109,6 +109,17 @@ def test_frames_of_a_process_that_wrote_nothing_are_no_lies(bags, tmp_path, caps
     later.slots = [record for record in later.slots if record.slot >= middle]
     assert Merge([read(bags[0]), later]).judge()["frames_heard_not_as_sent"] > 0
     assert Merge([read(bags[0]), later], ["runs/cf2"]).judge()["frames_heard_not_as_sent"] == 0
+
+
+def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: list[Path]) -> None:
+    """It holds only the time of all: what cf2 sent before it took that over is heard, and not known as sent."""
+    later = read(bags[1])
+    middle = later.slots[len(later.slots) // 2].slot
+    later.slots = [record for record in later.slots if record.slot >= middle]
+    merge = Merge([read(bags[0]), later])
+    assert count_unmatched_frames(merge.lives, merge.sent, True) > 0
+    assert count_unmatched_frames(merge.lives, merge.sent, True, [2]) == 0
+    assert count_unmatched_frames(merge.lives, merge.sent, True, [1]) > 0
 
 
 def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:

@@ -23,8 +23,8 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import read
 from dtsa_bench.pages.report.data import run_data
+from dtsa_bench.pages.view.history import RunHistory
 from dtsa_bench.pages.view.network_listener import NetworkListener
-from dtsa_bench.pages.view.track import Track
 
 # Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
 CONFIG = SwarmConfig(agents=3, policy="lease", slot_ms=50.0, open_every=0, adoption=False)
@@ -67,12 +67,12 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
                 helpers.go_on(flying, 100)
         finally:
             sniffed = sniffing.end()
-        track = Track("listener")
-        source = NetworkListener(track, CONFIG, port_settings(made, LISTENER))
+        history = RunHistory("listener")
+        source = NetworkListener(history, CONFIG, port_settings(made, LISTENER))
         source.stopped = True
         source.run()
     _, merged = helpers.merge_bags([directory / f"cf{agent}.mcap" for agent in (1, 2, 3)], directory / "whole")
-    return SimpleNamespace(agents=flying, sniffed=sniffed, shown=track.name, merged=merged, whole=directory / "whole")
+    return SimpleNamespace(agents=flying, sniffed=sniffed, shown=history.name, merged=merged, whole=directory / "whole")
 
 
 def own(agent: int) -> dict[str, int]:

@@ -94,7 +94,7 @@ def test_picture_has_all_colours_and_animation_is_small_and_moves(flights, tmp_p
         assert np.abs(seen - wanted).max(axis=1).min() < 16, colour
     path = tmp_path / "demo.gif"
     draw_animation(path, flights, slots := 20)
-    assert path.stat().st_size < 2_000_000 * slots / 80
+    assert path.stat().st_size < 600_000 * slots / 80
     with Image.open(path) as film:
         assert film.n_frames == slots  # type: ignore[attr-defined]
         first = np.asarray(film.convert("RGB"))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bag_helpers import flight_bag
 from cli_helpers import refused
-from view_helpers import AGENTS, PATIENCE_S, SLOTS, lossy_bag, numbers, track_of
+from view_helpers import AGENTS, PATIENCE_S, SLOTS, history_of, lossy_bag, numbers
 
 pytest.importorskip("aiohttp")
 
@@ -22,10 +22,17 @@ from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.knowledge import observed
 from dtsa_bench.log.record import load_log
-from dtsa_bench.pages.view.moments import MOST_FRAMES, UNKNOWN, Moment, Moments
-from dtsa_bench.pages.view.orders import Order, read_order
-from dtsa_bench.pages.view.server import ViewServer, _Reader
-from dtsa_bench.pages.view.track import MOST_BYTES, MOST_MOMENTS, Track
+from dtsa_bench.pages.view.history import (
+    MAX_BYTES,
+    MAX_FRAMES,
+    MAX_MOMENTS,
+    UNKNOWN,
+    Moment,
+    MomentBuilder,
+    RunHistory,
+)
+from dtsa_bench.pages.view.page_commands import PageCommand, parse_command
+from dtsa_bench.pages.view.server import ViewServer, _PageStream
 from dtsa_channel_sim.model.verdict import SUCCESS
 
 
@@ -35,15 +42,15 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def track(bag: Path) -> Track:
-    return track_of(bag)
+def history(bag: Path) -> RunHistory:
+    return history_of(bag)
 
 
-def test_moments_tell_what_the_bag_holds(bag: Path, track: Track) -> None:
+def test_moments_tell_what_the_bag_holds(bag: Path, history: RunHistory) -> None:
     run = load_log(bag)
-    _, moments = track.since(0, MOST_MOMENTS)
+    _, moments = history.since(0, MAX_MOMENTS)
     told = [json.loads(moment.text) for moment in moments]
-    assert track.state == "recorded"
+    assert history.state == "recorded"
     slots, senders, outcomes, received = (
         np.concatenate([numbers(one["frames"][name], kind) for one in told])
         for name, kind in (("slot", "<u4"), ("sender", "<u2"), ("outcome", "u1"), ("received", "u1"))
@@ -59,12 +66,12 @@ def test_moments_tell_what_the_bag_holds(bag: Path, track: Track) -> None:
     assert told[-1]["slot"] == SLOTS
 
 
-def test_ages_and_beliefs_are_those_of_the_report(bag: Path, track: Track) -> None:
+def test_ages_and_beliefs_are_those_of_the_report(bag: Path, history: RunHistory) -> None:
     run = load_log(bag)
     ages = run.knowledge.ages
     assert ages is not None
     by_slot = {one.slot: one for one in observed(run)}
-    _, moments = track.since(0, MOST_MOMENTS)
+    _, moments = history.since(0, MAX_MOMENTS)
     for moment in moments[3:]:
         told = numbers(json.loads(moment.text)["age"], "<u2")
         known = ages.age[moment.slot - 1]
@@ -77,27 +84,27 @@ def test_ages_and_beliefs_are_those_of_the_report(bag: Path, track: Track) -> No
                 assert heard[agent - 1] == age
 
 
-def test_a_track_and_what_waits_for_a_page_are_limited() -> None:
-    found = Track("long")
-    found.begin({})
-    for slot in range(MOST_MOMENTS + 10):
-        found.add(Moment(slot, "{}", b"", b""))
-    first, moments = found.since(0, 5)
+def test_a_history_and_what_waits_for_a_page_are_limited() -> None:
+    history = RunHistory("long")
+    history.start_run({})
+    for slot in range(MAX_MOMENTS + 10):
+        history.append(Moment(slot, "{}", b"", b""))
+    first, moments = history.since(0, 5)
     assert (first, moments[0].slot, len(moments)) == (10, 10, 5)
-    found.begin({})
+    history.start_run({})
     for slot in range(5):
-        found.add(Moment(slot, "", b"", bytes(MOST_BYTES // 4)))
-    first, moments = found.since(0, 100)
+        history.append(Moment(slot, "", b"", bytes(MAX_BYTES // 4)))
+    first, moments = history.since(0, 100)
     assert len(moments) <= 4
     assert moments[-1].slot == 4
     swarm = Swarm(SwarmConfig(agents=AGENTS))
-    moments, reason = Moments(swarm.scenario), np.zeros(AGENTS, np.uint8)
-    for slot in range(5 * MOST_FRAMES // 2):
-        moments.frames(slot, SUCCESS, (slot % AGENTS + 1,), reason, None)
+    builder, reason = MomentBuilder(swarm.scenario), np.zeros(AGENTS, np.uint8)
+    for slot in range(5 * MAX_FRAMES // 2):
+        builder.add_frames(slot, SUCCESS, (slot % AGENTS + 1,), reason, None)
     slots = [
-        numbers(json.loads(moments.take(slot, None, swarm.chosen, None).text)["frames"]["slot"], "<u4") for _ in "ab"
+        numbers(json.loads(builder.build(slot, None, swarm.chosen, None).text)["frames"]["slot"], "<u4") for _ in "ab"
     ]
-    assert slots[0].tolist() == list(range(slot - MOST_FRAMES + 1, slot + 1))
+    assert slots[0].tolist() == list(range(slot - MAX_FRAMES + 1, slot + 1))
     assert not len(slots[1])
 
 
@@ -123,7 +130,7 @@ async def _statuses(url: str) -> dict[str, int]:
         async with session.ws_connect(url + "stream", headers={"Origin": base}) as stream:
             found["stream"] = 101
             assert (await stream.receive_json(timeout=PATIENCE_S))["kind"] == "begin"
-            await stream.send_str(json.dumps({"order": {"kind": "jam", "value": True}}))
+            await stream.send_str(json.dumps({"command": {"kind": "jam", "value": True}}))
             while (told := await stream.receive_json(timeout=PATIENCE_S))["kind"] != "answer":
                 pass
             assert told["text"].startswith("refused")
@@ -133,8 +140,8 @@ async def _statuses(url: str) -> dict[str, int]:
     return found
 
 
-def test_only_who_knows_the_token_and_comes_from_here_gets_anything(track: Track) -> None:
-    with serving(ViewServer(track, "some-token")) as url:
+def test_only_who_knows_the_token_and_comes_from_here_gets_anything(history: RunHistory) -> None:
+    with serving(ViewServer(history, "some-token")) as url:
         assert url.startswith("http://127.0.0.1:")
         found = asyncio.run(_statuses(url))
     allowed = {name: status for name, status in found.items() if status < 400}
@@ -144,8 +151,8 @@ def test_only_who_knows_the_token_and_comes_from_here_gets_anything(track: Track
 
 def test_a_page_that_does_not_read_costs_nothing_and_garbage_is_let_go() -> None:
     """The server's memory stays where it is while moments go on; another page gets them all."""
-    found = Track("fast")
-    found.begin({"agents": 1})
+    history = RunHistory("fast")
+    history.start_run({"agents": 1})
     big = Moment(0, json.dumps({"filler": "x" * 200_000}), b"", b"")
 
     async def session(url: str) -> int:
@@ -158,7 +165,7 @@ def test_a_page_that_does_not_read_costs_nothing_and_garbage_is_let_go() -> None
         got = 0
         async with aiohttp.ClientSession() as client, client.ws_connect(url + "stream", max_msg_size=0) as stream:
             for _ in range(40):
-                found.add(big)
+                history.append(big)
             while got < 40:
                 message = await stream.receive_json(timeout=PATIENCE_S)
                 got += len(message.get("moments", ()))
@@ -169,7 +176,7 @@ def test_a_page_that_does_not_read_costs_nothing_and_garbage_is_let_go() -> None
         sleeping.close()
         return got
 
-    with serving(ViewServer(found, "some-token")) as url:
+    with serving(ViewServer(history, "some-token")) as url:
         assert asyncio.run(session(url)) == 40
 
 
@@ -187,32 +194,32 @@ class Page:
 
 @pytest.mark.parametrize("steps", range(25))
 def test_a_page_is_let_go_wherever_sending_stands(steps: int) -> None:
-    found = Track("fast")
-    found.begin({"agents": 1})
+    history = RunHistory("fast")
+    history.start_run({"agents": 1})
     for _ in range(500):
-        found.add(Moment(0, "{}", b"", b""))
+        history.append(Moment(0, "{}", b"", b""))
 
     async def session() -> bool:
-        reader = _Reader(page := Page(), found)  # type: ignore[arg-type]
-        running = asyncio.create_task(reader.run())
+        stream = _PageStream(page := Page(), history)  # type: ignore[arg-type]
+        running = asyncio.create_task(stream.run())
         for _ in range(steps):
             await asyncio.sleep(0)
-        await reader.end(running)
+        await stream.end(running)
         return running.done() and (page.closed or not steps)
 
     assert asyncio.run(session())
 
 
-def test_orders_are_checked() -> None:
+def test_commands_are_checked() -> None:
     losses = ({"kind": "loss", "value": value} for value in (2, "1", True, float("nan")))
     others = ({"kind": "emergency"}, {"kind": "emergency", "value": True}, {"kind": "partition", "value": "1" * 5000})
     kinds = ({"kind": "reboot"}, {"kind": "kill"}, {"kind": "kill", "value": True}, {"kind": "jam", "value": 1})
     for content in (None, [], {}, *kinds, *losses, *others):
         with pytest.raises(ConfigError):
-            read_order(content)
-    assert read_order({"kind": "kill", "value": 3}) == Order("kill", 3)
-    assert read_order({"kind": "loss", "value": 1}) == Order("loss", value=1.0)
-    assert read_order({"kind": "partition", "value": ""}) == Order("partition", value="")
+            parse_command(content)
+    assert parse_command({"kind": "kill", "value": 3}) == PageCommand("kill", 3)
+    assert parse_command({"kind": "loss", "value": 1}) == PageCommand("loss", value=1.0)
+    assert parse_command({"kind": "partition", "value": ""}) == PageCommand("partition", value="")
 
 
 @pytest.mark.parametrize(("words", "text"), [
@@ -227,8 +234,8 @@ def test_a_page_is_told_once_that_nobody_hears_anybody(tmp_path: Path) -> None:
     """Also afterwards, of a bag; of one in which frames are heard it is told nothing."""
     for name, loss, told in (("deaf", 1.0, 1), ("well", 0.2, 0)):
         flight_bag(tmp_path / name, slots=300, loss=loss, agents=4, policy="tdma")
-        track = track_of(tmp_path / name)
-        moments = [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
+        history = history_of(tmp_path / name)
+        moments = [json.loads(moment.text) for moment in history.since(0, MAX_MOMENTS)[1]]
         texts = [event[2] for moment in moments for event in moment["events"]]
         found = [text for text in texts if text.startswith("nobody heard anybody: ")]
         assert len(found) == told, texts

@@ -16,14 +16,13 @@ pytest.importorskip("aiohttp")
 
 import aiohttp
 from browser_helpers import CHROMIUM, MISSING, browsing, colours, serving
-from view_helpers import AGENTS, PATIENCE_S, lossy_bag, numbers, on_graph, track_of, viewed_flight
+from view_helpers import AGENTS, PATIENCE_S, history_of, lossy_bag, numbers, on_graph, viewed_flight
 from waiting import wait_for
 
 from dtsa_bench.log.record import load_log
-from dtsa_bench.pages.view.moments import Moment
-from dtsa_bench.pages.view.orders import Order
+from dtsa_bench.pages.view.history import MAX_MOMENTS, Moment, RunHistory, VehicleStates
+from dtsa_bench.pages.view.page_commands import PageCommand
 from dtsa_bench.pages.view.server import ViewServer
-from dtsa_bench.pages.view.track import MOST_MOMENTS, Track, Vehicles
 
 FIGURES = """(() => ({
   heads: [...document.querySelectorAll("h2")].map(node => node.textContent),
@@ -35,8 +34,8 @@ FIGURES = """(() => ({
 
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def test_chromium_plays_a_run_and_shows_what_an_agent_believes(tmp_path: Path) -> None:
-    track = track_of(lossy_bag(tmp_path))
-    with serving(ViewServer(track, "some-token")) as url, browsing() as browser:
+    history = history_of(lossy_bag(tmp_path))
+    with serving(ViewServer(history, "some-token")) as url, browsing() as browser:
         browser.open(url)
         browser.wait_for("dtsa.live.view.run.record.count >= 150")
         browser.run("dtsa.clock.set(1.0); if (dtsa.clock.playing) dtsa.clock.toggle(); dtsa.clock.set(1.0)")
@@ -50,8 +49,8 @@ def test_chromium_plays_a_run_and_shows_what_an_agent_believes(tmp_path: Path) -
         browser.run("document.querySelectorAll('button.agent')[1].click()")
         browser.wait_for("dtsa.live.view.run.ghosts(1.0) !== null")
         ages = browser.run("[...dtsa.live.view.run.ghosts(1.0).age]")
-        row = next(k for k, m in enumerate(track.since(0, 1000)[1]) if m.slot == 100)
-        assert ages == np.frombuffer(track.since(row, 1)[1][0].belief(2, AGENTS)[0], "<u2").tolist()
+        row = next(k for k, m in enumerate(history.since(0, 1000)[1]) if m.slot == 100)
+        assert ages == np.frombuffer(history.since(row, 1)[1][0].belief(2, AGENTS)[0], "<u2").tolist()
         before = browser.run("dtsa.clock.time")
         browser.run("dtsa.clock.toggle()")
         browser.wait_for(f"dtsa.clock.time > {before} + 0.1")
@@ -61,27 +60,29 @@ def test_chromium_plays_a_run_and_shows_what_an_agent_believes(tmp_path: Path) -
 
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def test_chromium_shows_what_crazyflies_say_as_text(tmp_path: Path) -> None:
-    recorded = track_of(lossy_bag(tmp_path))
-    mission = Track("mission")
+    recorded = history_of(lossy_bag(tmp_path))
+    mission = RunHistory("mission")
     info = {"name": "mission", "live": True, "control": True, "listener": True}
-    mission.begin({**(recorded.info[1] or {}), **info})
-    mission.vehicles = Vehicles((("cf1", "flying", 3.91, 0.98, ""), ("cf2", "<b>landing</b>", 3.2, 0.5, "low battery")))
-    mission.add(Moment(0, recorded.since(0, 1)[1][0].text, b"", b""))
-    with serving(ViewServer(mission, "some-token", lambda order: "")) as url, browsing() as browser:
+    mission.start_run({**(recorded.info[1] or {}), **info})
+    mission.vehicles = VehicleStates(
+        (("cf1", "flying", 3.91, 0.98, ""), ("cf2", "<b>landing</b>", 3.2, 0.5, "low battery"))
+    )
+    mission.append(Moment(0, recorded.since(0, 1)[1][0].text, b"", b""))
+    with serving(ViewServer(mission, "some-token", lambda command: "")) as url, browsing() as browser:
         browser.open(url)
         browser.wait_for("document.querySelector('.vehicles tbody').textContent.includes('<b>landing</b>')")
-        browser.wait_for("document.querySelectorAll('.orders').length === 1")
+        browser.wait_for("document.querySelectorAll('.commands').length === 1")
         assert browser.run("document.querySelectorAll('.listener').length") == 1
         assert browser.complaints() == []
 
 
-def slots_of(track: Track) -> int:
-    return sum(len(numbers(json.loads(m.text)["frames"]["slot"], "<u4")) for m in track.since(0, MOST_MOMENTS)[1])
+def slots_of(history: RunHistory) -> int:
+    return sum(len(numbers(json.loads(m.text)["frames"]["slot"], "<u4")) for m in history.since(0, MAX_MOMENTS)[1])
 
 
-def words_of(track: Track) -> str:
+def words_of(history: RunHistory) -> str:
     return "\n".join(
-        event[2] for moment in track.since(0, MOST_MOMENTS)[1] for event in json.loads(moment.text)["events"]
+        event[2] for moment in history.since(0, MAX_MOMENTS)[1] for event in json.loads(moment.text)["events"]
     )
 
 
@@ -93,7 +94,7 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
 
     words = ("--mode", "realtime", "--policy", "lease", "--agents", "3", "--slot-ms", "40", "--tail-s", "90")
     page = viewed_flight(tmp_path / "run", *words, "--control")
-    listener = Track("graph")
+    listener = RunHistory("graph")
     with browsing() as browser, page as (process, url), ExitStack() as stack:
         browser.open(url)
         browser.wait_for("dtsa.live.view.run.record.count > 20")
@@ -101,23 +102,23 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
         domain = int(re.search(r"\bROS_DOMAIN_ID=(\d+)", environment)[1])  # type: ignore[index]
         source = stack.enter_context(on_graph(listener, domain))
         wait_for(lambda: listener.since(0, 1)[1], what="nothing is heard on the graph")
-        browser.run("document.querySelector('.orders select').value = '2'")
-        browser.run("document.querySelector('[data-order=kill]').click()")
+        browser.run("document.querySelector('.commands select').value = '2'")
+        browser.run("document.querySelector('[data-command=kill]').click()")
         browser.wait_for("dtsa.live.view.run.lost.has(2)")
         browser.wait_for("[...document.querySelectorAll('.events li')].some(node => node.textContent.includes('cf2'))")
-        browser.run("document.querySelector('[data-order=jam]').click()")
+        browser.run("document.querySelector('[data-command=jam]').click()")
         browser.wait_for("dtsa.live.view.run.events.some(event => event.text.includes('jam is True'))")
-        browser.run("document.querySelector('[data-order=clear]').click()")
-        browser.run("document.querySelector('[data-order=start]').click()")
+        browser.run("document.querySelector('[data-command=clear]').click()")
+        browser.run("document.querySelector('[data-command=start]').click()")
         browser.wait_for("!dtsa.live.view.run.lost.has(2)")
         assert browser.complaints() == []
         wait_for(lambda: "cf2 takes part again" in words_of(listener))  # who listens on the graph sees the same
-        source.order(Order("loss", value=0.25))
+        source.command(PageCommand("loss", value=0.25))
         wait_for(lambda: "loss 0.25: done" in words_of(listener))
         browser.wait_for("dtsa.live.view.run.events.some(event => event.text.includes('loss is 0.25'))")
         wait_for(lambda: slots_of(listener) > 50)
         stack.close()
-        assert listener.since(0, MOST_MOMENTS)[1][-1].heard
+        assert listener.since(0, MAX_MOMENTS)[1][-1].heard
 
 
 @pytest.mark.ros

@@ -1,4 +1,4 @@
-"""Integration: Crazyflies on the live page: their bridge's words are shown, and orders reach simulated vehicles."""
+"""Integration: Crazyflies on the live page: their bridge's words are shown, and commands reach simulated vehicles."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from view_helpers import on_graph
 from waiting import wait_for
 
 from dtsa_bench.flights.domain import ros_domain
+from dtsa_bench.pages.view.history import RunHistory
 from dtsa_bench.pages.view.server import ViewServer
-from dtsa_bench.pages.view.track import Track
 
 pytestmark = [pytest.mark.ros]
 COUNT = 2
 STATES = "[...document.querySelectorAll('.vehicles tbody tr')].map(row => row.children[1].firstChild.textContent)"
-CLICK = "document.querySelector('[data-order={}]').click()"
+CLICK = "document.querySelector('[data-command={}]').click()"
 
 
 def all_are(state: str) -> str:
@@ -39,9 +39,9 @@ def all_are(state: str) -> str:
 
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 @pytest.mark.realtime
-def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Path) -> None:
+def test_commands_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Path) -> None:
     """Without a run: the bridge alone."""
-    track = Track("/swarm")
+    history = RunHistory("/swarm")
     with ros_domain() as domain, fake_fleet(tmp_path, COUNT) as fleet, browsing() as browser, ExitStack() as stack:
         config = tmp_path / "swarm.yaml"
         # Nobody streams commands; the browser takes the processor from all.
@@ -52,8 +52,8 @@ def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Pa
         stack.callback(end_process, bridge)
         pilot = ServedNode(domain, "pilot")
         stack.callback(pilot.close)
-        source = stack.enter_context(on_graph(track, domain))
-        browser.open(stack.enter_context(serving(ViewServer(track, "some-token", source.order))))
+        source = stack.enter_context(on_graph(history, domain))
+        browser.open(stack.enter_context(serving(ViewServer(history, "some-token", source.command))))
         browser.wait_for(all_are("ready"))
         assert pilot.call(Arm, "/all/arm", arm=True).success
         browser.wait_for(all_are("armed"))
@@ -65,7 +65,7 @@ def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Pa
         browser.wait_for(all_are("ready"))
         browser.wait_for("document.querySelector('.vehicles .answer').textContent === 'land: done'")
         browser.run(CLICK.format("emergency"))  # the first step of two
-        browser.wait_for("document.querySelector('[data-order=emergency]').textContent.startsWith('Once more')")
+        browser.wait_for("document.querySelector('[data-command=emergency]').textContent.startsWith('Once more')")
         assert browser.run(STATES) == ["ready"] * COUNT
         browser.run(CLICK.format("emergency"))
         browser.wait_for(all_are("emergency"))

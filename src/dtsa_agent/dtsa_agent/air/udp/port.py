@@ -6,12 +6,14 @@ import fcntl
 import socket
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from dtsa_agent.air.port import ReceivedDatagram
+from dtsa_agent.air.port import ClockMap, ReceivedDatagram
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.kernel import ffi, lib
+from dtsa_agent.core.station import Station
 
 from .settings import UdpSettings
 
@@ -19,55 +21,7 @@ _SIOCGIFADDR = 0x8915
 _IP_RECVERR = 11
 _IP_MULTICAST_ALL = 49  # Linux: 0: only groups that this socket has joined
 _SO_TIMESTAMPNS = 35
-_STAMP = struct.Struct("@ll")
-_ROOM = socket.CMSG_SPACE(_STAMP.size)  # bytes for a stamp beside a datagram
-_LONGEST = 512  # bytes of a datagram that are looked at; frames of ours are far shorter
-_SECOND = 1_000_000_000
-_STEP_NS = 1_000_000  # the clock of the stamps has been set if it moved by this between two looks
-_EXACT_NS = 2_000  # between two looks at one clock: good enough for the other one in between
-_OLDEST_NS = 60 * _SECOND  # a stamp cannot be older than the longest sleep of a process
-_LOOK_NS = _SECOND  # a listener looks this often whether its interface is still the same
-
-
-class StampClock:
-    """Turns the kernel's stamps of arrival, which are CLOCK_REALTIME, into CLOCK_MONOTONIC.
-
-    Both clocks are looked at after datagrams have been read. When the first one has been set since the last look,
-    stamps of before are worth nothing, and the time of the look stands for them.
-    """
-
-    def __init__(self) -> None:
-        self._ahead_ns, self._now_ns = _look()
-        self._usable = True
-        self.steps = 0  # how often the clock of the stamps has been set
-
-    def look(self) -> None:
-        """Datagrams have been read: looks at both clocks."""
-        ahead, self._now_ns = _look()
-        self._usable = abs(ahead - self._ahead_ns) <= _STEP_NS
-        self.steps += not self._usable
-        self._ahead_ns = ahead
-
-    def arrival_ns(self, stamp_ns: int | None) -> int:
-        """When a datagram arrived, CLOCK_MONOTONIC.
-
-        :param stamp_ns: the kernel's stamp, CLOCK_REALTIME; None: it has given none.
-        """
-        if stamp_ns is None or not self._usable:
-            return self._now_ns
-        arrival = stamp_ns - self._ahead_ns
-        return arrival if -_OLDEST_NS < arrival - self._now_ns <= 0 else self._now_ns
-
-
-def _look() -> tuple[int, int]:
-    """How far CLOCK_REALTIME is ahead of CLOCK_MONOTONIC, ns, and the latter, ns: the best of three looks."""
-    best = (1 << 62, 0, 0)
-    for _ in range(3):
-        before, real, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        if after - before < _EXACT_NS:
-            return real - (before + after) // 2, after
-        best = min(best, (after - before, real - (before + after) // 2, after))
-    return best[1], best[2]
+_LOOK_NS = 1_000_000_000  # a listener looks this often whether its interface is still the same
 
 
 class Place(NamedTuple):
@@ -94,8 +48,8 @@ class UdpPort:
         place = _place(settings)
         self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._stamps = StampClock()
-        self.unreadable = 0  # how often it could not be read
+        self._reader = ffi.new("socket_reader *")
+        lib.socket_start(self._reader, self._in.fileno())
         self.interface_changes = 0  # how often the group was joined again
         self.say: Callable[[str], None] | None = None  # is told a line when the interface goes, and when it is back
         self._place: Place | None = None  # by which the group is joined; None: the interface has gone
@@ -113,7 +67,6 @@ class UdpPort:
             self.close()
             where = f"{settings.interface}, group {group}:{port}"
             raise ConfigError("interface", where, f"one that takes part in the group ({error.strerror})") from None
-        self._read = self._in.recvmsg
 
     def _join(self, place: Place) -> None:
         """Joins the group, and sends to it, by an interface as it is now."""
@@ -135,7 +88,8 @@ class UdpPort:
             raise
         self._out.close()
         self._out, self._membership, self._place = out, membership, place
-        self.address: tuple[str, int] = out.getsockname()  # from which it sends
+        address, number = out.getsockname()  # from which it sends
+        self._reader.address, self._reader.port = socket.inet_aton(address), number
 
     def look(self) -> bool:
         """Joins the group again if the interface is another one than before; whether that was so."""
@@ -184,29 +138,31 @@ class UdpPort:
 
         :param most: number of datagrams at a time.
         """
+        self._look_in_time()
+        count = lib.socket_read(self._reader, most)
+        return [
+            ReceivedDatagram(bytes(ffi.buffer(one.data, one.length)), one.arrival_ns, bool(one.own))
+            for one in (self._reader.datagrams[k] for k in range(count))
+        ]
+
+    def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
+        """Hand what has arrived, but for its own, to a station; returns how many datagrams have, so many at most."""
+        self._look_in_time()
+        count: int = lib.socket_deliver(self._reader, most, station.c, clock.offset_ns, clock.drift_ppb, clock.began_ns)
+        station.raise_fault()
+        return count
+
+    def _look_in_time(self) -> None:
         now = time.monotonic_ns()
         if now >= self._look_ns:
             self._look_ns = now + _LOOK_NS
             self.look()
-        arrived: list[tuple[bytes, list[tuple[int, int, bytes]], int, Any]] = []  # as the system gives them
-        try:
-            while len(arrived) < most:
-                arrived.append(self._read(_LONGEST, _ROOM))
-        except (BlockingIOError, InterruptedError):
-            pass
-        except OSError:  # an interface that has gone, for example: it may come back
-            self.unreadable += 1
-        if not arrived:
-            return []
-        self._stamps.look()  # afterwards: however long this process was kept waiting, all have arrived before
-        when, own = self._stamps.arrival_ns, self.address
-        return [ReceivedDatagram(data, when(_stamp(notes)), source == own) for data, notes, _, source in arrived]
 
     def counts(self) -> dict[str, int]:
         """Failed reads, how often the clock has been set, and how often the interface was another one."""
         return {
-            "unreadable": self.unreadable,
-            "clock_steps": self._stamps.steps,
+            "unreadable": self._reader.unreadable,
+            "clock_steps": self._reader.clock_steps,
             "interface_changes": self.interface_changes,
         }
 
@@ -220,15 +176,6 @@ class UdpPort:
 
     def __exit__(self, *unused: object) -> None:
         self.close()
-
-
-def _stamp(notes: Sequence[tuple[int, int, bytes]]) -> int | None:
-    """The kernel's stamp of a datagram, CLOCK_REALTIME, ns; None: it has given none."""
-    for level, kind, value in notes:
-        if kind == _SO_TIMESTAMPNS and level == socket.SOL_SOCKET and len(value) >= _STAMP.size:
-            seconds, nanoseconds = _STAMP.unpack_from(value)
-            return int(seconds) * _SECOND + int(nanoseconds)
-    return None
 
 
 def _place(settings: UdpSettings) -> Place:

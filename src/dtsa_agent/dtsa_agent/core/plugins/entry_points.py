@@ -73,7 +73,7 @@ class PluginSwarm(Swarm):
     Its kernel leaves to this class what is not built in; parameters are those of :class:`Swarm`.
     """
 
-    _all_in_c = False
+    all_in_c = False
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)

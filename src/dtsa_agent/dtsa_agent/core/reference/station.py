@@ -498,27 +498,32 @@ class Station:
         self.same_id_until = arrival + self.patience_ns
         return SAME_ID
 
-    def step(self, now: Ns) -> tuple[Ns, Datagram]:
-        """Does one thing that is due; when to call again (now: at once), and what to send now."""
+    def _due_ns(self, now: Ns) -> Ns:
         if self.state == LISTENING:
-            if now < self.deadline_ns:
-                return self.deadline_ns, b""
+            return self.deadline_ns
+        if self.frame:
+            return self.slot_start_ns(self.slot)
+        following = self.slot_start_ns(self.slot + 1)
+        must_decide = self.awaits and now >= following - self.lead_ns
+        return following - (self.latest_lead_ns if must_decide else self.lead_ns)
+
+    def step(self, now: Ns) -> tuple[Ns, Datagram]:
+        """Does one thing that is due; when to call again (not after now: at once), and what to send now."""
+        datagram, due = b"", self._due_ns(now)
+        if now < due:
+            return due, b""
+        if self.state == LISTENING:
             late_ns = self.settings.late_ns
             self.origin_ns, self.state = now - self.round_ns if late_ns is None else late_ns, ALONE
             self.in_step_ns = now
             self._restart(now)
-        if self.frame:
-            start = self.slot_start_ns(self.slot)
-            return (start, b"") if now < start else (now, self._send(now - start, now))
-        following = self.slot_start_ns(self.slot + 1)
-        for due in (following - self.lead_ns, following - self.latest_lead_ns if self.awaits else 0):
-            if now < due:
-                return due, b""
-        if now - following > self.too_long_ns:
+        elif self.frame:
+            datagram = self._send(now - due, now)
+        elif now - self.slot_start_ns(self.slot + 1) > self.too_long_ns:
             self._restart(now)
         else:
             self._open_slot(self.slot + 1, now)
-        return now, b""
+        return self._due_ns(now), datagram
 
     def _send(self, late_ns: int, now: Ns) -> Datagram:
         if late_ns > self.latest_send_ns:  # it would disturb the next turn

@@ -42,7 +42,7 @@ def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
 class ReferenceSwarm(Swarm):
     """Some or all agents of one swarm, each with a table of its own; parameters are those of :class:`Swarm`."""
 
-    _all_in_c = False
+    all_in_c = False
     shares = False  # beside agents that share a table: those that are switched off hear, too
 
     def __init__(

@@ -191,7 +191,7 @@ DTSA_API void dtsa_station_observe(dtsa_station *station, const dtsa_station_eve
 DTSA_API dtsa_verdict dtsa_station_receive(dtsa_station *station, const uint8_t *data, long length,
                                            int64_t arrival_ns);
 /* Does one thing that is due; the agent's state at this moment counts. Returns when to call again at
- * the latest (now: at once). datagram: room for DTSA_DATAGRAM_MAX bytes, or for the length of one. */
+ * the latest (not after now: at once). datagram: room for DTSA_DATAGRAM_MAX bytes, or for the length of one. */
 DTSA_API int64_t dtsa_station_step(dtsa_station *station, int64_t now_ns, uint8_t *datagram,
                                    int *length);
 /* What became of the datagram that the last step gave: taken 0: the port refused it. */
@@ -203,6 +203,9 @@ DTSA_API int dtsa_station_awaits_frame(const dtsa_station *station, int64_t now_
 DTSA_API int dtsa_station_hovers(const dtsa_station *station);   /* DTSA_FLIES.. in this slot */
 DTSA_API int64_t dtsa_station_slot(const dtsa_station *station); /* -1: none yet */
 DTSA_API int64_t dtsa_station_slot_start(const dtsa_station *station, int64_t slot);
+/* The longest that it has waited for a frame of an agent, slots; it had heard the agent before, and
+ * the agent had not left. 0, and no agent: none. */
+DTSA_API int64_t dtsa_station_longest_gap(dtsa_station *station, int *agent);
 DTSA_API void dtsa_station_get_status(const dtsa_station *station, dtsa_station_status *status);
 
 #ifdef __cplusplus

@@ -154,10 +154,23 @@ static void restart(dtsa_station *s, int64_t now)
     s->newcomer = 1;
     s->hovers = DTSA_HOVERS_NEW;
     delay_reset(s);
-    for (int k = 0; k < s->settings.agents; k++) s->peers[k].hears_us = 0;
+    for (int k = 0; k < s->settings.agents; k++) {
+        s->peers[k].hears_us = 0;
+        s->peers[k].was_heard = 0;
+    }
     s->agent.restart(s->agent.context);
     if (s->events.restarted) s->events.restarted(s->events.context, s->slot);
     s->counts.restarts++;
+}
+
+/* An agent that is not new has waited for a frame of another one until a slot. */
+static void note_gap(dtsa_station *s, int k, int64_t slot)
+{
+    const peer *p = &s->peers[k];
+    const int32_t gap = (int32_t)((uint32_t)slot - p->heard_slot);
+    if (s->newcomer || !p->was_heard || gap <= s->longest_gap) return;
+    s->longest_gap = gap;
+    s->longest_of = k + 1;
 }
 
 static void hear_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t *datagram,
@@ -165,7 +178,12 @@ static void hear_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t 
 {
     const int accepted =
         s->agent.hear(s->agent.context, slot, datagram + s->head_length, s->settings.frame_length);
-    s->counts.heard += (uint32_t)accepted;
+    if (accepted) {
+        s->counts.heard++;
+        note_gap(s, sender - 1, slot);
+        s->peers[sender - 1].heard_slot = (uint32_t)slot;
+        s->peers[sender - 1].was_heard = !s->peers[sender - 1].left;
+    }
     if (s->awaits && slot >= s->slot) s->awaits = 0;
     if (s->events.heard)
         s->events.heard(s->events.context, sender, slot, datagram, s->datagram_length, arrival,
@@ -370,31 +388,35 @@ dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long len
 
 /* ---- what is due ---- */
 
+/* When something is due: in the past, at once. An agent that waits for a frame looks when it could
+ * decide, and once more when it has to. */
+static int64_t due_ns(const dtsa_station *s, int64_t now)
+{
+    if (s->state == DTSA_LISTENING) return s->deadline_ns;
+    if (s->frame_length) return dtsa_station_slot_start(s, s->slot);
+    const int64_t next = dtsa_station_slot_start(s, s->slot + 1);
+    return next - (s->awaits && now >= next - s->lead_ns ? s->latest_lead_ns : s->lead_ns);
+}
+
 int64_t dtsa_station_step(dtsa_station *s, int64_t now, uint8_t *datagram, int *length)
 {
     *length = 0;
+    const int64_t due = due_ns(s, now);
+    if (now < due) return due;
     if (s->state == DTSA_LISTENING) {
-        if (now < s->deadline_ns) return s->deadline_ns;
         /* Not slot 0: that is for agents that are told to begin together. */
         s->origin_ns = s->settings.begins ? s->settings.origin_ns : now - s->round_ns;
         s->state = DTSA_ALONE;
         s->in_step_ns = now;
         restart(s, now);
-    }
-    if (s->frame_length) {
-        const int64_t start = dtsa_station_slot_start(s, s->slot);
-        if (now < start) return start;
+    } else if (s->frame_length) {
         *length = send(s, now, datagram);
-        return now;
-    }
-    const int64_t next = dtsa_station_slot_start(s, s->slot + 1);
-    if (now < next - s->lead_ns) return next - s->lead_ns;
-    if (s->awaits && now < next - s->latest_lead_ns) return next - s->latest_lead_ns;
-    if (now - next > s->too_long_ns)
+    } else if (now - dtsa_station_slot_start(s, s->slot + 1) > s->too_long_ns) {
         restart(s, now);
-    else
+    } else {
         open_slot(s, s->slot + 1, now);
-    return now;
+    }
+    return due_ns(s, now);
 }
 
 int dtsa_station_hovers(const dtsa_station *s) { return s->hovers; }
@@ -406,6 +428,13 @@ int dtsa_station_awaits_frame(const dtsa_station *s, int64_t now)
     const int64_t next = dtsa_station_slot_start(s, s->slot + 1);
     return s->state == DTSA_LISTENING ||
            (s->awaits && !s->frame_length && now >= next - s->lead_ns);
+}
+
+int64_t dtsa_station_longest_gap(dtsa_station *s, int *agent)
+{
+    for (int k = 0; k < s->settings.agents; k++) note_gap(s, k, s->slot);
+    *agent = s->longest_of;
+    return s->longest_gap;
 }
 
 void dtsa_station_get_status(const dtsa_station *s, dtsa_station_status *status)

@@ -19,8 +19,10 @@ typedef struct peer {
     int64_t last_slot; /* of that frame, as on the air; -1: none */
     int64_t offset_ns, report_ns, reported_ns, sum_ns; /* see delay.c */
     int32_t unnamed;                                   /* its datagrams since it named this agent */
-    int8_t hears_us;                                   /* 1: yes, -1: no, 0: it has not said */
-    uint8_t steady;                                    /* its last two frames show the same time */
+    uint32_t heard_slot;
+    int8_t hears_us;   /* 1: yes, -1: no, 0: it has not said */
+    uint8_t was_heard; /* since this agent began anew, last in heard_slot (low bits) */
+    uint8_t steady;    /* its last two frames show the same time */
     uint8_t known, left;
     uint8_t resting; /* it sends in main anchors alone: it rests, or is on probation */
 } peer;
@@ -65,6 +67,8 @@ struct dtsa_station {
     int early_count;
     uint64_t sent_hashes[SENT_HISTORY_LENGTH];
     unsigned sent_index;
+    int32_t longest_gap; /* slots, between two frames of the agent longest_of */
+    int longest_of;
     dtsa_station_status counts;
 };
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -176,13 +176,19 @@ def compare_decisions(lives: Mapping[Life, AgentBag], replays: Mapping[Life, Pro
     }
 
 
-def count_unmatched_frames(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], complete: bool) -> int:
-    """How many frames were heard that their sender's bag does not have, or has otherwise."""
-    return _crossings(lives, sent, complete)[0]
+def count_unmatched_frames(
+    lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], complete: bool, partly: Collection[int] = ()
+) -> int:
+    """How many frames were heard that their sender's bag does not have, or has otherwise.
+
+    :param complete: whether all that was sent is there.
+    :param partly: but for frames of these agents.
+    """
+    return _crossings(lives, sent, complete, partly)[0]
 
 
 def _crossings(
-    lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], complete: bool
+    lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], complete: bool, partly: Collection[int] = ()
 ) -> tuple[int, list[Crossing]]:
     """How many frames were heard that their sender's bag does not have, and all others."""
     strange, found = 0, []
@@ -198,7 +204,7 @@ def _crossings(
                     origin = earlier.get((heard.slot, heard.sender), origin)
                 if origin is not None and origin.record.datagram == heard.datagram:
                     found.append(Crossing(origin.life, receiver, origin.record.sent_ns, heard.arrival_ns))
-                elif origin is not None or heard.sender in whole:
+                elif heard.sender not in partly and (origin is not None or heard.sender in whole):
                     strange += 1
     return strange, found
 

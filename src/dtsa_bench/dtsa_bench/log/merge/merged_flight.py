@@ -53,7 +53,8 @@ class MergedFlight:
         replays = {life: ProcessReplay(bag) for life, bag in self.lives.items()}
         flown = flight_results(replay_flight(self.lives, replays, self.senders(), self.common_slot))
         complete = not self.about["nothing_written"] and not self.about["not_on_the_time_line"]
-        unmatched = count_unmatched_frames(self.lives, sent, complete)
+        gave_up = self.about.get("agents_that_gave_up_a_time", ())
+        unmatched = count_unmatched_frames(self.lives, sent, complete, gave_up)
         return {
             **{name: self.about[name] for name in ("missing", "broken_off", "nothing_written", "not_determined")},
             "frames_heard_not_as_sent": self.about["frames_heard_not_as_sent"] + unmatched,

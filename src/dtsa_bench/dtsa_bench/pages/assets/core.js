@@ -1,5 +1,5 @@
 "use strict";
-/* What all parts of the page share: data, time, colours, small helpers. */
+/* What all parts of a page that plays a run share: data, time, colours, small helpers. */
 const DATA = JSON.parse(document.getElementById("data").textContent), RUNS = DATA.runs, PALETTE = DATA.palette;
 
 function bytes(text) {
@@ -33,30 +33,6 @@ function after(values, value, count = values.length) {
   while (low < high) { const middle = (low + high) >> 1; if (values[middle] <= value) low = middle + 1; else high = middle; }
   return low;
 }
-
-/* An element: el("div", {class: "a", onclick: f}, child, "text"). Text is never read as HTML. */
-function el(name, attributes, ...children) {
-  const svg = ["svg", "g", "path", "line", "rect", "text", "polyline", "circle"].includes(name);
-  const node = svg ? document.createElementNS("http://www.w3.org/2000/svg", name) : document.createElement(name);
-  for (const [key, value] of Object.entries(attributes || {})) {
-    if (key.startsWith("on")) node.addEventListener(key.slice(2), value);
-    else if (value !== null && value !== undefined && value !== false) node.setAttribute(key, value);
-  }
-  for (const child of children.flat()) if (child !== null && child !== undefined) node.append(child);
-  return node;
-}
-
-/* ---- theme ---- */
-const theme = {
-  set(name) { document.documentElement.dataset.theme = name; this.cache = {}; },
-  color(name) {
-    this.cache[name] ??= getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
-    return this.cache[name];
-  },
-  get dark() { return document.documentElement.dataset.theme === "dark"; },
-  cache: {},
-};
-theme.set(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
 
 /* Reasons have the same colour in all runs; the most frequent ones have those that are farthest apart. */
 const REASONS = (() => {
@@ -127,14 +103,7 @@ function onRedraw(node, draw) {
   new ResizeObserver(() => requestAnimationFrame(() => { if (node.clientWidth !== width) run(); })).observe(node);
 }
 const redrawAll = () => redraws.forEach(draw => draw());
-function setTheme(name) { theme.set(name); redrawAll(); clock.tell(); }
-function themeButton() {
-  const name = () => theme.dark ? "Light" : "Dark", button = el("button", {type: "button", onclick: () => { setTheme(name().toLowerCase()); button.textContent = name(); }}, name());
-  return button;
-}
-let beforePrint = null;
-addEventListener("beforeprint", () => { beforePrint = document.documentElement.dataset.theme; setTheme("light"); });
-addEventListener("afterprint", () => { if (beforePrint) setTheme(beforePrint); });
+theme.changed = () => { redrawAll(); clock.tell(); };
 
 const sharpness = {ratio: Math.max(2, devicePixelRatio || 1)}; // pixels drawn for one of the page
 function prepare(canvas, width, height) {

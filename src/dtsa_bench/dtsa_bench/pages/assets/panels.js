@@ -1,5 +1,5 @@
 "use strict";
-/* Panels beside the scene: figures of the moment, ages, events, and what may be ordered. */
+/* Panels beside the scene: figures of the moment, ages, events, and commands. */
 import {NOT_KNOWN} from "./run.js";
 
 /* Who sent in the last slot before a time, and why. */
@@ -43,8 +43,8 @@ const FIGURES = [
 ];
 
 export class Panels {
-  /* order(content): sends an order; null: nothing may be ordered. choose(agent): whose beliefs are shown, 0: nobody's. */
-  constructor(run, order, choose) {
+  /* command(content): sends a command; null: commands are not allowed. choose(agent): whose beliefs are shown, 0: nobody's. */
+  constructor(run, command, choose) {
     this.run = run; this.choose = choose; this.listed = -1;
     this.values = FIGURES.map(() => [el("div", {class: "value"}), el("div", {class: "extra"})]);
     this.figures = el("div", {class: "figures"}, ...FIGURES.map(([label], k) => el("div", {class: "figure"}, el("div", {class: "label"}, typeof label === "string" ? label : label(run)), ...this.values[k])));
@@ -54,7 +54,7 @@ export class Panels {
       el("div", {class: "rows"}, ...this.rows.map(row => row.node)));
     this.list = el("ol", {class: "events"});
     this.events = el("section", {class: "log"}, el("h2", {}, "Events"), this.list);
-    this.control = order ? this.orders(order) : null;
+    this.control = command ? this.commands(command) : null;
   }
 
   row(id) {
@@ -71,13 +71,13 @@ export class Panels {
     clock.tell();
   }
 
-  orders(order) {
+  commands(command) {
     const agent = el("select", {"aria-label": "agent"}, ...this.rows.map(row => el("option", {value: row.id}, `cf${row.id}`)));
     const loss = el("input", {type: "number", min: 0, max: 100, step: 1, value: 0, "aria-label": "loss in percent"});
     const half = Math.floor(this.run.agents / 2), ids = [...Array(this.run.agents).keys()].map(k => k + 1), groups = half ? JSON.stringify([ids.slice(0, half), ids.slice(half)]) : "";
     const partition = el("input", {type: "text", placeholder: groups, "aria-label": "groups of a partition", size: 16});
-    const button = (text, content, name) => el("button", {type: "button", "data-order": name, onclick: () => order(content())}, text);
-    return el("section", {class: "orders"}, el("h2", {}, "Control"),
+    const button = (text, content, name) => el("button", {type: "button", "data-command": name, onclick: () => command(content())}, text);
+    return el("section", {class: "commands"}, el("h2", {}, "Control"),
       this.run.mode === "realtime" ? el("div", {class: "line"}, agent, button("Kill", () => ({kind: "kill", value: +agent.value}), "kill"), button("Start", () => ({kind: "start", value: +agent.value}), "start")) : null,
       el("div", {class: "line"}, loss, "% loss", button("Set", () => ({kind: "loss", value: Math.min(1, Math.max(0, +loss.value / 100))}), "loss")),
       el("div", {class: "line"}, button("Jam", () => ({kind: "jam", value: true}), "jam"), button("Stop jamming", () => ({kind: "jam", value: false}), "clear")),
@@ -118,19 +118,19 @@ const SURE_MS = 3000;
 
 /* Crazyflies as their bridge sees them, with or without a run. */
 export class Crazyflies {
-  /* order(content): sends an order; null: nothing may be ordered. */
-  constructor(order) {
+  /* command(content): sends a command; null: commands are not allowed. */
+  constructor(command) {
     this.rows = el("tbody");
     this.answer = el("output", {class: "answer"});
     const titles = ["", "State", "Battery", "Link"].map(name => el("th", {}, name));
     this.node = el("section", {class: "vehicles"}, el("h2", {}, "Crazyflies"), el("table", {}, el("thead", {}, el("tr", {}, ...titles)), this.rows),
-      ...(order ? [el("div", {class: "line"}, el("button", {type: "button", "data-order": "land", onclick: () => order({kind: "land"})}, "Land all"), this.stop(order)), this.answer] : []));
+      ...(command ? [el("div", {class: "line"}, el("button", {type: "button", "data-command": "land", onclick: () => command({kind: "land"})}, "Land all"), this.stop(command)), this.answer] : []));
   }
 
   /* To stop all motors takes two clicks within three seconds. */
-  stop(order) {
-    const button = el("button", {type: "button", class: "danger", "data-order": "emergency", onclick: () => {
-      if (button.dataset.sure) { order({kind: "emergency", value: "stop all motors"}); calm(); return; }
+  stop(command) {
+    const button = el("button", {type: "button", class: "danger", "data-command": "emergency", onclick: () => {
+      if (button.dataset.sure) { command({kind: "emergency", value: "stop all motors"}); calm(); return; }
       button.dataset.sure = "1"; button.textContent = "Once more: all motors stop, all fall";
       setTimeout(calm, SURE_MS);
     }}, "");
@@ -139,7 +139,7 @@ export class Crazyflies {
     return button;
   }
 
-  /* rows: [name, state, battery (V), link quality (0 to 1), reason] of each; answer: what has come of the last order. */
+  /* rows: [name, state, battery (V), link quality (0 to 1), reason] of each; answer: result of the last command. */
   show(rows, answer) {
     this.rows.replaceChildren(...rows.map(([name, state, battery, link, reason]) => el("tr", {class: `is-${state.split(" ")[0]}`, title: reason},
       el("td", {}, name), el("td", {}, state, reason ? el("small", {}, reason) : null), el("td", {}, battery > 0 ? num(battery, 2, "V") : "–"), el("td", {}, percent(link, 0)))));

@@ -1,7 +1,7 @@
 "use strict";
 /* Puts the page together: header, figures, sections, player. */
 const single = RUNS.length === 1;
-const root = document.getElementById("report"), main = el("main");
+const root = document.getElementById("page"), main = el("main");
 root.className = single ? "single" : "several";
 
 function section(title, what, make, size = "", runs = RUNS) {
@@ -49,7 +49,7 @@ const scaleButton = single ? null : el("button", {type: "button", "aria-pressed"
 root.append(el("header", {},
   el("div", {}, el("p", {class: "kicker"}, single ? "Recorded run" : `${RUNS.length} recorded runs`), el("h1", {}, single ? RUNS[0].name : RUNS.map(run => run.name).join("  ·  ")),
     single ? el("p", {class: "lede"}, lede(RUNS[0])) : null),
-  el("span", {class: "options"}, scaleButton, " ", themeButton(), " ", el("button", {type: "button", onclick: () => print()}, "Print"))));
+  el("span", {class: "options"}, scaleButton, " ", themeButton(), " ", printButton())));
 for (const run of RUNS) for (const note of run.notes) root.append(el("p", {class: "note"}, single ? note : `${run.name}: ${note}`));
 if (single) {
   root.append(el("div", {class: "figures"}, ...shownFigures.map(([label, value, extra, kind]) => {
@@ -107,7 +107,7 @@ section("Mission", "With Crazyflies, from take-off to landing, as the ground sta
       el("tbody", {}, ...run.mission.vehicles.map(([name, first, least, quality, age, latency, states]) => el("tr", {}, el("td", {}, name), el("td", {}, num(first, 2, "V")), el("td", {}, num(least, 2, "V")),
         el("td", {}, percent(quality)), el("td", {}, num(age, 2, "s")), el("td", {}, num(latency, 1, "ms")), el("td", {style: "white-space:normal"}, states)))))),
     el("details", {}, el("summary", {}, `${run.mission.events.length} events: orders, states, safety actions`),
-      el("div", {class: "scroll", style: "max-height:420px;overflow:auto"}, el("table", {}, el("tbody", {}, ...run.mission.events.map(([time, level, text]) =>
+      el("div", {class: "scroll tall"}, el("table", {}, el("tbody", {}, ...run.mission.events.map(([time, level, text]) =>
         el("tr", {}, el("td", {}, num(time, 2, "s")), el("td", {class: level === "error" ? "bad" : ""}, level), el("td", {style: "white-space:normal;text-align:left"}, text)))))))),
 }, "wide");
 
@@ -194,5 +194,6 @@ const start = RUNS[0].distances && RUNS[0].distances.pairs.length ? RUNS[0].dist
 clock.set(Number(new URLSearchParams(location.hash.slice(1)).get("t") ?? start) || 0);
 /* A page that is loaded again stands where it stood. */
 addEventListener("pagehide", () => { try { history.replaceState(null, "", `#t=${clock.time.toFixed(3)}`); } catch { /* not allowed here */ } });
+document.querySelectorAll(".scroll").forEach(watchScroll);
 redrawAll();
 document.documentElement.dataset.ready = "";

@@ -43,7 +43,7 @@ export class Series {
     this.step = (this.time[this.time.length - 1] - this.time[0]) / POINTS;
   }
 
-  get most() { return Math.max(1e-9, ...this.values.flat().filter(value => value !== null)); }
+  get most() { return Math.max(0, ...this.values.flat().filter(value => value !== null)) || 1; }
 }
 
 /* The two agents that are closest: [distance, id, id]. */

@@ -51,7 +51,8 @@ class SlotLine {
   }
 
   draw(time) {
-    if (!this.record.count) return; // nothing has come yet
+    this.whole.hidden = this.part.hidden = !this.record.count;
+    if (!this.record.count) return; // no slot is known yet
     const current = Math.min(this.record.first + this.record.count - 1, Math.floor(time / this.run.slot_s + 1e-6));
     this.shown = Math.min(this.record.count, WINDOW, Math.max(30, Math.floor((this.width - LEFT - RIGHT) / 5.5))); // fewer on a phone
     this.from = Math.max(this.record.first, Math.min(this.record.first + this.record.count - this.shown, current - Math.floor(this.shown / 2)));

@@ -9,7 +9,7 @@ const MODES = {
 const LISTENER = "As a listener on the network knows it: positions are those of the last frames, flown on until the next; ages are the listener's. Not known here: who received a frame, what the agents believe, whether they agree, and where they truly are. A slot in which nothing was heard counts as idle.";
 const FRAME_MS = 30, SLOW_MS = 90, LAG_S = 0.12, CHARTS_MS = 1000;
 sharpness.ratio = Math.min(2, devicePixelRatio || 1);
-const root = document.getElementById("report"), main = el("main");
+const root = document.getElementById("page"), main = el("main");
 const live = {on: false, play: false, drawn: 0, charted: 0, socket: null, answers: [], view: null, crazyflies: null};
 globalThis.dtsa = {live, clock}; // for tests, and for the curious; live.view: {run, panels, node, show}
 const scene = {yaw: -0.9, pitch: 0.62, zoom: 1, paths: false, names: true, targets: true, buttons: {}, scenes: [], draw() { this.scenes.forEach(one => one.context && one.draw(clock.time)); }};
@@ -56,7 +56,7 @@ requestAnimationFrame(tick);
 
 /* ---- the run ---- */
 function makeView(run) {
-  const panels = new Panels(run, DATA.control && run.control ? content => send({order: content}) : null, agent => send({ghosts: agent}));
+  const panels = new Panels(run, DATA.control && run.control ? content => send({command: content}) : null, agent => send({ghosts: agent}));
   const chart = (name, what, ...rest) => el("section", {class: "half"}, el("h2", {}, name), el("p", {class: "what"}, what), ...rest);
   const strip = new SlotLine(run), color = ["success", "collision", "idle"].map(name => () => theme.color(name));
   const series = (data, colors, most, unit, label, digits, suffix, limits = []) => lineChart({time: data.time, unit, label, digits, suffix, limits, height: 180, high: most,
@@ -103,7 +103,7 @@ function begin(info) {
 /* Beside a run where there is one; alone before it begins. */
 function showVehicles(message) {
   if (!live.crazyflies) {
-    live.crazyflies = new Crazyflies(DATA.control ? content => send({order: content}) : null);
+    live.crazyflies = new Crazyflies(DATA.control ? content => send({command: content}) : null);
     (live.view ? live.view.node.querySelector(".side") : main).prepend(live.crazyflies.node);
   }
   live.crazyflies.show(message.rows, message.answer);

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
 from PIL import Image
 
 from dtsa_bench.drawing.flight_paths import frame_bare, paint
@@ -25,6 +27,8 @@ from .flights import AGENTS, KILLED, LIVE_AGENTS, LIVE_SLOT_MS, DemoFlight, Fini
 HOVER = "#c3ccd6"  # of cells: an agent that hovers has nothing new to say
 FIRST, COUNT = 100, 40  # the slots that are shown, well under way
 ROUNDS = 16  # columns of each part around a death or a return
+FRAME_MS, LAST_FRAME_MS = 90, 3500  # of the animation
+_RGB = np.array([1 << 16, 1 << 8, 1])  # a colour as one number
 WIDTH, LEFT, RIGHT = 8.6, 0.4, 0.4  # inches, of the picture and its margins
 TITLE = "One radio channel, twelve quadcopters: who speaks next?"
 INTRO = (
@@ -74,8 +78,12 @@ def draw_demo(path: Path, steps: Sequence[Sequence[DemoFlight]], flights: Flight
         sheet = _Sheet(12.5)
         sheet.text(LEFT, 0.3, TITLE, 15.5, fontweight="bold")
         sheet.text(LEFT, 0.68, textwrap.fill(INTRO, 118), 9, color=QUIET)
-        draws: tuple[Callable[[_Sheet, float, Sequence[FinishedFlight]], None], ...]
-        draws = (_draw_paths, _draw_ages, _draw_losses, _draw_killing)
+        draws: tuple[Callable[[_Sheet, float, Sequence[FinishedFlight]], None], ...] = (
+            _draw_paths,
+            partial(_draw_strips, head="known state is\nthis old", value="age"),
+            partial(_draw_strips, head="position is\nwrong by", value="error"),
+            _draw_killing,
+        )
         for number, (top, step, draw) in enumerate(zip((1.22, 3.98, 6.88, 9.84), steps, draws, strict=True), 1):
             title, sentence = step_text(number, flights)
             sheet.rule(top)
@@ -164,24 +172,16 @@ def _draw_paths(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> No
     axes.set_title("how far off the others are thought to be (mm)", fontsize=7.8, fontweight="normal", pad=5)
 
 
-def _draw_ages(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> None:
-    _draw_strips(sheet, top, step, "known state is\nthis old", [finished.age for finished in step])
-
-
-def _draw_losses(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> None:
-    _draw_strips(sheet, top, step, "position is\nwrong by", [finished.error for finished in step])
-
-
-def _draw_strips(sheet: _Sheet, top: float, step: Sequence[FinishedFlight], head: str, values: Sequence[str]) -> None:
+def _draw_strips(sheet: _Sheet, top: float, step: Sequence[FinishedFlight], head: str, value: str) -> None:
     """Steps 2 and 3: which agents sent in each slot."""
     _top_view(sheet.axes(LEFT, top + 0.03, 1.42, 1.42), step[-1])
     sheet.text(WIDTH - RIGHT, top - 0.02, head, 7, color=QUIET, ha="right")
     first, width = slots_shown(step), 4.12
-    for index, (finished, value) in enumerate(zip(step, values, strict=True)):
+    for index, finished in enumerate(step):
         y = top + 0.28 + 0.36 * index
         sheet.text(1.98, y - 0.03, finished.flight.name, 8.6, fontweight="bold")
         sheet.text(1.98, y + 0.125, finished.flight.does, 6.4, color=QUIET)
-        sheet.text(WIDTH - RIGHT, y - 0.01, value, 9.5, fontweight="bold", ha="right")
+        sheet.text(WIDTH - RIGHT, y - 0.01, getattr(finished, value), 9.5, fontweight="bold", ha="right")
         axes = sheet.axes(3.32, y, width, width / COUNT * 1.6)
         draw_cells(axes, finished, [(x, 0, finished.senders[first + x]) for x in range(COUNT)], 5.2)
         axes.set(xlim=(0, COUNT), ylim=(0, 1))
@@ -304,19 +304,34 @@ def draw_animation(path: Path, flights: Flights, slots: int = 80) -> None:
             strip = sheet.axes(1.6, top + 0.6, 7.04, 0.52)
             strip.set(xlim=(0, across), ylim=(2, 0))
             drawn.append((finished, sheet.axes(0.1, top + 0.06, 1.3, 1.3), strip))
-        writer = PillowWriter(fps=11)
-        with writer.saving(sheet.figure, path, 100):
-            for frame in range(slots):
-                for finished, view, strip in drawn:
-                    slot = min(FIRST + frame, len(finished.senders) - 1)
-                    cell = frame % across, frame // across, finished.senders[slot] if slot == FIRST + frame else ()
-                    draw_cells(strip, finished, [cell], 7)
-                    view.clear()
-                    paint(view, finished.position[: slot + 1], finished.scenario.moving, ids=False, scale=0.62)
-                    senders = [sender - 1 for sender in finished.senders[slot]]
-                    shade = COLLIDED if len(senders) > 1 else INK
-                    view.plot(*finished.position[slot][:2, senders], "o", mfc="none", mec=shade, ms=13, mew=1.4)
-                    frame_bare(view, finished.position)
-                writer.grab_frame()
-            for _ in range(38):  # the last one stays
-                writer.grab_frame()
+        canvas, pictures = FigureCanvasAgg(sheet.figure), []
+        for frame in range(slots):
+            for finished, view, strip in drawn:
+                slot = min(FIRST + frame, len(finished.senders) - 1)
+                cell = frame % across, frame // across, finished.senders[slot] if slot == FIRST + frame else ()
+                draw_cells(strip, finished, [cell], 7)
+                view.clear()
+                paint(view, finished.position[: slot + 1], finished.scenario.moving, ids=False, scale=0.62)
+                senders = [sender - 1 for sender in finished.senders[slot]]
+                shade = COLLIDED if len(senders) > 1 else INK
+                view.plot(*finished.position[slot][:2, senders], "o", mfc="none", mec=shade, ms=13, mew=1.4)
+                frame_bare(view, finished.position)
+            canvas.draw()
+            pictures.append(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
+    durations = [FRAME_MS] * (slots - 1) + [LAST_FRAME_MS]
+    first, *rest = _with_one_palette(pictures)
+    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
+
+
+def _with_one_palette(pictures: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:
+    """Pictures, (H, W, 3) each, in the 255 most frequent colours of the last: what does not move does not change."""
+    colours, counts = np.unique(pictures[-1] @ _RGB, return_counts=True)
+    palette = colours[np.argsort(-counts, kind="stable")[:255]][:, None] // _RGB % 256
+    frames = []
+    for picture in pictures:
+        shades, index = np.unique(picture @ _RGB, return_inverse=True)
+        nearest = ((shades[:, None, None] // _RGB % 256 - palette) ** 2).sum(axis=2).argmin(axis=1).astype(np.uint8)
+        frame = Image.fromarray(nearest[index.reshape(picture.shape[:2])])
+        frame.putpalette(palette.astype(np.uint8).tobytes())
+        frames.append(frame)
+    return frames

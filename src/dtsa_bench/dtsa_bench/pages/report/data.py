@@ -17,21 +17,21 @@ from dtsa_bench.pages.html import BINS, flatten, pack, reduce_bins, thin
 from dtsa_bench.runs.hearing import recorded_problem, sentence
 from dtsa_channel_sim.model.verdict import OUTCOMES
 
-from .distances import collision_m, crashes_of, distance_charts, pair_distances
+from .distances import collision_m, distance_chart, list_crashes, pair_distances
 
 SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second
 SCENE_VALUES = 600_000  # most numbers in the replay: longer runs of larger swarms get fewer frames
 UNKNOWN = -32768  # in the replay: it is not known where the agent was
-VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
-EVENTS = 1000  # of a mission, most that are shown
+VEHICLE_VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
+MAX_EVENTS = 1000  # of a mission
 
 Array = NDArray[np.float64]
 
 
 def run_data(path: str | Path) -> dict[str, Any]:
-    """All that the page shows of one run (run directory, bag directory or .mcap file), as JSON types.
+    """Return all that the page shows of one run (run directory, bag directory or .mcap file), as JSON types.
 
-    :raises UnusableBag: if it is none of a swarm's run.
+    :raises UnusableBag: if it has no run of a swarm.
     """
     run = open_log(path)
     distances = pair_distances(run, collision_m(run))
@@ -53,17 +53,17 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "notes": notes,
         "config": flatten(run.settings),
         "agents": run.agents,
-        "crashes": crashes_of(distances, run, summary),
+        "crashes": list_crashes(distances, run, summary),
         "moving": scenario.moving.tolist() if scenario else [True] * run.agents,
         "slot_s": run.slot_ns / 1e9,
         "duration_s": _duration_s(run),
         "summary": summary,
         "scene": _scene(run, scenario),
         "slots": _slots(run),
-        "channel": _channel(run),
+        "channel": _channel_use(run),
         "decisions": _reasons(run),
         "sent_for": _sent_for(run),
-        "distances": distance_charts(distances, run),
+        "distances": distance_chart(distances, run),
         "ages": _ages(ages, run),
         "table": _table(run, ages, scenario),
     }
@@ -156,7 +156,7 @@ def _bin_of(run: FlightLog, slots: NDArray[np.int64]) -> tuple[NDArray[np.int64]
     return np.clip(slots * count // len(run), 0, count - 1), count, middle
 
 
-def _channel(run: FlightLog) -> dict[str, Any] | None:
+def _channel_use(run: FlightLog) -> dict[str, Any] | None:
     slots = np.flatnonzero(run.recorded)
     if not len(slots):
         return None
@@ -228,14 +228,15 @@ def _table(run: FlightLog, ages: Ages | None, scenario: Scenario | None) -> list
     frames, path = run.sent_frames, run.path
     rows = []
     for agent in range(1, run.agents + 1):
-        mine = frames.sender == agent
-        sent = int(mine.sum())
+        own = frames.sender == agent
+        offered = int(run.known_receivers[own].sum())
+        known_share = own.any() and (offered or run.merged is None)
         row: dict[str, Any] = {
             "id": agent,
             "moving": bool(scenario.moving[agent - 1]) if scenario else None,
-            "sent": sent,
-            "heard": _heard_share(run, mine),
-            "collided": int((frames.collided[mine] > 0).sum()) if run.merged is None else None,
+            "sent": int(own.sum()),
+            "heard": round(float(frames.received[own].sum()) / max(1, offered), 4) if known_share else None,
+            "collided": int((frames.collided[own] > 0).sum()) if run.merged is None else None,
         }
         if ages is not None:
             column = ages.results, agent - 1
@@ -253,16 +254,8 @@ def _table(run: FlightLog, ages: Ages | None, scenario: Scenario | None) -> list
     return rows
 
 
-def _heard_share(run: FlightLog, mine: NDArray[np.bool_]) -> float | None:
-    """Share of an agent's receivers that received its frames; None without any of which it is known."""
-    offered = int(run.known_receivers[mine].sum())
-    if not mine.any() or (run.merged is not None and not offered):
-        return None
-    return round(float(run.sent_frames.received[mine].sum()) / max(1, offered), 4)
-
-
 def mission_data(path: str | Path) -> dict[str, Any] | None:
-    """What `mission.json` beside a bag says of a mission with Crazyflies; None: there is none."""
+    """Return the contents of `mission.json` beside the bag of a mission with Crazyflies; None: there is none."""
     place = Path(path)
     for directory in (place, place.parent, place.parent.parent):
         file = directory / "mission.json"
@@ -271,16 +264,12 @@ def mission_data(path: str | Path) -> dict[str, Any] | None:
     else:
         return None
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-        vehicles = [
-            [
-                str(name),
-                *(values.get(key) for key in VALUES),
-                " → ".join(str(s["state"]) for s in values["states"]),
-            ]
-            for name, values in found["vehicles"].items()
-        ]
-        events = [[float(e["t_s"]), str(e["level"]), str(e["text"])] for e in found["events"]]
-        return {"cut_short": str(found["cut_short"]), "vehicles": vehicles, "events": events[:EVENTS]}
+        mission = json.loads(file.read_text(encoding="utf-8"))
+        vehicles = []
+        for name, values in mission["vehicles"].items():
+            states = " → ".join(str(state["state"]) for state in values["states"])
+            vehicles.append([str(name), *(values.get(key) for key in VEHICLE_VALUES), states])
+        events = [[float(event["t_s"]), str(event["level"]), str(event["text"])] for event in mission["events"]]
+        return {"cut_short": str(mission["cut_short"]), "vehicles": vehicles, "events": events[:MAX_EVENTS]}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -14,7 +14,7 @@ from dtsa_bench.log.arrays import swarm_section
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.pages.html import reduce_bins, thin
 
-CRASHES = 50  # most that are shown
+MAX_CRASHES = 50  # that are shown
 PAIRS = 5  # closest pairs whose distance is drawn
 BLOCK = 512  # moments whose pair distances are computed at once
 
@@ -69,32 +69,32 @@ def collision_m(run: FlightLog) -> float:
     return float(limits.get("collision_m", 0.2)) if isinstance(limits, Mapping) else 0.2
 
 
-def crashes_of(distances: Distances | None, run: FlightLog, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+def list_crashes(distances: Distances | None, run: FlightLog, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Which agents crashed, when and where; the first ones if there are many."""
     if distances is None:
         return []
-    found = list(distances.crashes)
+    crashes = distances.crashes
     pair = tuple(summary.get("collided_pair") or ())
     path = run.path
-    if not found and len(pair) == 2:
+    if not crashes and len(pair) == 2:
         # They crashed within a slot, and only its ends were recorded.
         gap = path[:, :, pair[0] - 1] - path[:, :, pair[1] - 1]
-        found = [(*pair, int(np.nanargmin((gap**2).sum(axis=1))))]
-    crashes = []
-    for one, other, moment in found[:CRASHES]:
-        a, b = (path[moment, :, number - 1] for number in (one, other))
-        crashes.append(
+        crashes = [(*pair, int(np.nanargmin((gap**2).sum(axis=1))))]
+    rows = []
+    for first, second, moment in crashes[:MAX_CRASHES]:
+        a, b = (path[moment, :, agent - 1] for agent in (first, second))
+        rows.append(
             {
-                "ids": [one, other],
+                "ids": [first, second],
                 "time_s": round(float(distances.time_s[moment]), 3),
                 "place": thin((a + b) / 2, 3),
                 "distance_m": round(float(np.linalg.norm(a - b)), 4),
             }
         )
-    return crashes
+    return rows
 
 
-def distance_charts(distances: Distances | None, run: FlightLog) -> dict[str, Any] | None:
+def distance_chart(distances: Distances | None, run: FlightLog) -> dict[str, Any] | None:
     """Distances over time as a page shows them, and what they are compared with."""
     if distances is None:
         return None

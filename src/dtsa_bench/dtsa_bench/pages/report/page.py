@@ -20,10 +20,7 @@ def render(runs: Sequence[dict[str, Any]]) -> str:
     """The page of what `run_data` gave for each run."""
     title = " · ".join(run["name"] for run in runs) + " – DTSA report"
     data = {"runs": list(runs), "palette": PALETTE, "reasons": dict(REASON_TEXTS)}
-    return render_page(
-        "page.html", served=False, kind="report", title=title, styles=("style.css",),
-        scripts=(*SCRIPTS, "report.js"), data=data,
-    )  # fmt: skip
+    return render_page("report", title, (*SCRIPTS, "report.js"), data)
 
 
 def write_report(bags: Sequence[str | Path], out: str | Path, progress: Callable[[str], None] | None = None) -> Path:

@@ -21,7 +21,7 @@ class Part:
     """A part of a page: a figure, a table or a list below a heading."""
 
     title: str = ""
-    text: str = ""  # a caption where there is a figure
+    text: str = ""
     svg: str = ""
     heads: Sequence[str] = ()
     rows: Sequence[Sequence[str]] = ()
@@ -29,27 +29,31 @@ class Part:
 
 
 def write_tables(
-    path: Path, title: str, parts: Sequence[Part], lead: str = "", facts: Sequence[str] = (), command: str = ""
+    path: Path, kicker: str, title: str, parts: Sequence[Part], lead: str, facts: Sequence[str] = (), command: str = ""
 ) -> Path:
     """Write a page of parts; `command`: how it was made, shown so that it can be repeated."""
+    scripts = ("page.js", "tables.js")
     page = render_page(
-        "tables.html", served=False, kind="tables", title=title, styles=("tables.css",), lead=lead, facts=facts,
-        command=command, parts=parts,
-    )  # fmt: skip
+        "tables", title, scripts, {}, kicker=kicker, lead=lead, facts=facts, command=command, parts=parts
+    )
     write_page(path, page)
     return path
 
 
-def figure_part(svg: str, caption: str) -> Part:
+def _figure(svg: str, caption: str) -> Part:
     """A figure in the colours of the page."""
     return Part(svg=Markup(themed(svg)), text=caption)
 
 
 def write_report(table: SweepTable, directory: Path, code: str, command: str = "") -> Path:
-    """Draw all figures of a sweep into ``figures``, and write ``report.html``; `code`: fingerprint of what flew."""
+    """Draw all figures of a sweep into ``figures``, and write ``report.html``.
+
+    :param code: fingerprint of the code that flew.
+    :param command: how the sweep was made, shown so that it can be repeated.
+    """
     sweep, seeds = table.sweep, table.sweep.seeds
     drawn = [
-        figure_part(save(draw(table, spec), directory / "figures", spec["name"]), str(spec.get("caption", "")).strip())
+        _figure(save(draw(table, spec), directory / "figures", spec["name"]), str(spec.get("caption", "")).strip())
         for spec in sweep.figures
     ]
     facts = [
@@ -68,22 +72,23 @@ def write_report(table: SweepTable, directory: Path, code: str, command: str = "
         Part(text=text if left_out else none, list=[f"{count} {reason}" for reason, count in left_out]),
         Part("How to read this", list=notes),
     ]
-    return write_tables(directory / "report.html", sweep.title, sections, sweep.text, facts, command)
+    return write_tables(directory / "report.html", "Sweep", sweep.title, sections, sweep.text, facts, command)
 
 
 def _groups(table: SweepTable) -> Part:
     measures = table.known()
-    heads = [*table.sweep.axes, "crashed", "timed out", "failed", *map(label_of, measures), "counted"]
+    ends = [name for name in ("timed_out", "failed") if any(getattr(group, name) for group in table.flown)]
+    heads = [*table.sweep.axes, "crashed", *(name.replace("_", " ") for name in ends), *map(label_of, measures)]
     rows = []
     for group in table.flown:
         mark = Markup('<span class="bad">{}</span>' if group.crashed.count else '<span class="good">{}</span>')
         rows.append([
             *(str(group.labels[axis]) for axis in table.sweep.axes),
-            mark.format(_small(group.texts(CRASHED))), str(group.timed_out or ""), str(group.failed or ""),
+            mark.format(_small(group.texts(CRASHED))), *(str(getattr(group, name) or "") for name in ends),
             *(_small(group.texts(name)) for name in measures),
             f"{group.mean('min_distance_m').count}/{len(group.rows)}",
         ])  # fmt: skip
-    return Part("All settings", heads=heads, rows=rows)
+    return Part("All settings", heads=[*heads, "counted"], rows=rows)
 
 
 def _small(shown: tuple[str, str]) -> str:
@@ -106,14 +111,14 @@ def write_league(table: LeagueTable, directory: Path, command: str = "") -> Path
         for entry in table.entries
     ]
     sections = [
-        Part(heads=HEADS, rows=table.lines()),
-        figure_part(save(league_scores(table), directory / "figures", "scores"), _SCORES),
+        Part("Results", heads=HEADS, rows=table.lines()),
+        _figure(save(league_scores(table), directory / "figures", "scores"), _SCORES),
         Part("Cells", heads=("cell", "what it is"), rows=[(name, league.cells[name]["text"]) for name in table.cells]),
         Part("Ages", _CELLS, heads=("scheme", *table.cells), rows=table.cell_lines()),
         Part("Entries", heads=("scheme", "settings", "package", "commit", "flown"), rows=entries),
         Part("How to read this", list=_LEAGUE_NOTES),
     ]
-    return write_tables(directory / "league.html", league.title, sections, lead, command=command)
+    return write_tables(directory / "league.html", "League", league.title, sections, lead, command=command)
 
 
 _NOTES = (

@@ -1,4 +1,4 @@
-"""Follows a run by its messages on the ROS graph, and hands it to a page moment by moment."""
+"""Follows a run by its messages on the ROS graph, and adds its moments to a history."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.hearing import Hearing, Unheard
 from dtsa_bench.runs.metrics import metrics_tables
 
-from .moments import BELIEFS, Moments, run_info
-from .orders import PROCESS_ORDERS
-from .track import Track
+from .history import MAX_BELIEVERS, MomentBuilder, RunHistory, run_info
+from .page_commands import PROCESS_COMMANDS
 
-_PAIRS = 100  # agents: of larger swarms crashes are not looked for
+_MAX_CRASH_AGENTS = 100  # in larger swarms no crashes are detected
 _FARTHEST_M = 1e6
 _PERIOD_NS = 50_000_000  # simulated, from one moment to the next
 _SLOTS = 64  # whose frames wait for the channel's verdict
@@ -32,22 +31,21 @@ class Follower:
     """Receives a run's messages slot by slot; those that cannot be used are counted and left out.
 
     Objects of rclpy and of other decoders will do: only the fields' names and contents matter.
-
-    :param track: where the moments go.
-    :param info: further values for the page.
     """
 
-    def __init__(self, track: Track, info: Mapping[str, Any]) -> None:
-        self._track, self._more = track, dict(info)
+    def __init__(self, history: RunHistory, info: Mapping[str, Any]) -> None:
+        """:param info: further values for the page."""
+        self._history, self._more = history, dict(info)
         self._run: RunConfig | None = None
+        self._end_reason = ""
         self.unusable = 0
 
     @property
-    def begun(self) -> bool:
+    def has_settings(self) -> bool:
         """Whether the run's settings are known."""
         return self._run is not None
 
-    def begin(self, settings: Mapping[str, Any]) -> None:
+    def start(self, settings: Mapping[str, Any]) -> None:
         """Set up for a run with settings as its Configuration message and its bag hold them.
 
         :raises DtsaError: if they cannot be used.
@@ -59,9 +57,9 @@ class Follower:
         self._tables = self._make_tables(run)
         self._hearing, self._unheard = Hearing(self.agents), Unheard(run.swarm.slot_ns)
         self._slot_ns = run.swarm.slot_ns
-        self._every = max(1, round(_PERIOD_NS / self._slot_ns))  # slots from one moment to the next
-        self._moments = Moments(self.scenario, run.air)
-        self._place = np.array(self.scenario.start)  # (3, N) m
+        self._period = max(1, round(_PERIOD_NS / self._slot_ns))  # slots from one moment to the next
+        self._builder = MomentBuilder(self.scenario, run.air)
+        self._position = np.array(self.scenario.start)  # (3, N) m
         self._chosen = np.zeros(self.agents, np.uint16)
         self._digest = np.zeros(self.agents, np.uint32)
         self._reason = np.zeros(self.agents, np.uint8)
@@ -70,12 +68,12 @@ class Follower:
         self._next = 0  # first slot of the next moment
         self._absent: frozenset[int] = frozenset()
         self._crashed: set[tuple[int, int]] = set()
-        self._lag_ms, self._ended = 0.0, ""
+        self._lag_ms = 0.0
         self._pairs = np.triu_indices(self.agents, 1)
-        self._track.begin(run_info(self._track.name, run, self.scenario) | self._more)
+        self._history.start_run(run_info(self._history.name, run, self.scenario) | self._more)
 
     def _make_tables(self, run: RunConfig) -> Swarm | None:
-        if run.swarm.agents > BELIEFS:
+        if run.swarm.agents > MAX_BELIEVERS:
             return None
         try:
             return metrics_tables(run, self.scenario, everyone=True)
@@ -83,12 +81,12 @@ class Follower:
             return None  # frames with a key that is not here, or a policy that is not installed
 
     def receive(self, kind: str, message: Any) -> None:
-        """Take in a message; `kind` is its type without the package, as ``Reception``."""
+        """Receive a message; `kind` is its type without the package, as ``Reception``."""
         try:
             if kind == "Configuration":
                 settings = json.loads(message.settings)
                 if isinstance(settings, dict):
-                    self.begin(settings)
+                    self.start(settings)
             elif self._run is not None and (handler := self._HANDLERS.get(kind)):
                 handler(self, message)
         except (ValueError, TypeError, IndexError, KeyError, OverflowError, RecursionError, DtsaError):
@@ -117,22 +115,23 @@ class Follower:
         self._digest[index] = np.asarray(message.digest, np.uint32)
         self._reason[index] = np.asarray(message.reason, np.uint8)
 
-    def note(self, text: str, kind: str = "note") -> None:
-        """Add an event that has happened now."""
+    def note(self, text: str) -> None:
+        """Add an event of now."""
         if self._run is not None:
-            self._moments.event(self._slot, kind, text)
+            self._builder.add_event(self._slot, "note", text)
 
     def _receive_markers(self, message: Any) -> None:
         """Where all agents are at the start of a slot: the spheres, which come first."""
         spheres = message.markers[: self.agents]
-        place = np.array([(one.pose.position.x, one.pose.position.y, one.pose.position.z) for one in spheres])
-        if not np.abs(place).max(initial=0.0) < _FARTHEST_M:
+        points = [sphere.pose.position for sphere in spheres]
+        position = np.array([(point.x, point.y, point.z) for point in points]).reshape(-1, 3)
+        if not np.abs(position).max(initial=0.0) < _FARTHEST_M:
             raise ValueError("positions that are no numbers, or far away")
-        self._place[:, self._index([one.id for one in spheres])] = place.T
+        self._position[:, self._index([sphere.id for sphere in spheres])] = position.T
         stamp = spheres[0].header.stamp
-        past_ns = stamp.sec * 10**9 + stamp.nanosec - names.TIME_ZERO_NS
-        self._moments.place(past_ns // self._slot_ns, self._place)
-        self._find_crashes(past_ns // self._slot_ns)
+        slot = (stamp.sec * 10**9 + stamp.nanosec - names.TIME_ZERO_NS) // self._slot_ns
+        self._builder.add_positions(slot, self._position)
+        self._detect_crashes(slot)
 
     def _receive_reception(self, message: Any) -> None:
         """What became of a slot: the slot is complete, and its frames go into the tables."""
@@ -140,8 +139,8 @@ class Follower:
         self._index(senders)
         mask = unpack_received(bytes(np.asarray(message.received, np.uint8)), len(senders), self.agents)
         if slot >= self._next:
-            self._next = slot + self._every
-            self._hand_over(slot)
+            self._next = slot + self._period
+            self._add_moment(slot)
         frames = self._frames.pop(slot, {})
         if self._tables is not None:
             self.scenario.advance(slot, self._tables)
@@ -153,45 +152,45 @@ class Follower:
                 if sender in frames and mask[row].any() and self._tables.hear(slot, frames[sender], mask[row]):
                     self._hearing.take_in(mask[row])
             self._tables.end(slot)
-        self._moments.frames(slot, int(message.outcome), senders, self._reason, mask.astype(bool))
-        here = np.ones(self.agents, bool)
-        here[[agent - 1 for agent in self._absent]] = False
-        self._moments.choices(self._chosen[here])
+        self._builder.add_frames(slot, int(message.outcome), senders, self._reason, mask.astype(bool))
+        present = np.ones(self.agents, bool)
+        present[[agent - 1 for agent in self._absent]] = False
+        self._builder.add_choices(self._chosen[present])
         self._slot = slot + 1
 
-    def _hand_over(self, slot: int) -> None:
+    def _add_moment(self, slot: int) -> None:
         if self._tables is not None and self._run is not None:
             if self._run.swarm.estimator_row.needs_everybody:
-                self._tables.estimate_position[:] = self._place
+                self._tables.estimate_position[:] = self._position
             else:
                 self._tables.estimate(slot)
         if problem := self._unheard.news(slot, self._hearing.problem()):
-            self._moments.event(slot, "bad", problem)
+            self._builder.add_event(slot, "bad", problem)
         more: dict[str, Any] = {"lag_ms": round(self._lag_ms, 2)}
-        self._track.add(self._moments.take(slot, self._tables, self._chosen, self._digest, self._absent, **more))
+        self._history.append(self._builder.build(slot, self._tables, self._chosen, self._digest, self._absent, **more))
 
-    def _find_crashes(self, slot: int) -> None:
-        if self.agents > _PAIRS or self.agents < 2 or self._run is None:
+    def _detect_crashes(self, slot: int) -> None:
+        if self.agents > _MAX_CRASH_AGENTS or self.agents < 2 or self._run is None:
             return
         one, other = self._pairs
-        gap = ((self._place[:, one] - self._place[:, other]) ** 2).sum(axis=0)
+        gap = ((self._position[:, one] - self._position[:, other]) ** 2).sum(axis=0)
         for k in np.flatnonzero(gap < self._run.limits.collision_m**2).tolist():
             pair = int(one[k]) + 1, int(other[k]) + 1
             if pair not in self._crashed:
                 self._crashed.add(pair)
-                self._moments.crash(slot, pair, math.sqrt(gap[k]))
+                self._builder.add_crash(slot, pair, math.sqrt(gap[k]))
 
     def _receive_status(self, message: Any) -> None:
         """Which agents have fallen silent, and whether the run is over."""
         slot, lost = int(message.slot), frozenset((self._index(message.lost) + 1).tolist())
         for agent in sorted(lost - self._absent):
-            self._moments.event(slot, "lost", f"cf{agent} has fallen silent")
+            self._builder.add_event(slot, "lost", f"cf{agent} has fallen silent")
         for agent in sorted(self._absent - lost):
-            self._moments.event(slot, "back", f"cf{agent} takes part again")
+            self._builder.add_event(slot, "back", f"cf{agent} takes part again")
         self._absent, self._lag_ms = lost, float(message.lag_ms)
-        if message.phase == 2 and not self._ended:  # RunStatus.ENDED
-            self._ended = str(message.reason)[:300] or "over"
-            self._moments.event(slot, "end", f"the run has ended: {self._ended}")
+        if message.phase == 2 and not self._end_reason:  # RunStatus.ENDED
+            self._end_reason = str(message.reason)[:300] or "over"
+            self._builder.add_event(slot, "end", f"the run has ended: {self._end_reason}")
 
     def _receive_change(self, message: Any) -> None:
         """A setting of the channel was changed while it ran."""
@@ -199,16 +198,16 @@ class Follower:
             value = parameter.value
             fields = (value.bool_value, value.integer_value, value.double_value, value.string_value)
             text = repr(fields[int(value.type) - 1])[:80] if 1 <= int(value.type) <= 4 else "?"
-            if parameter.name in PROCESS_ORDERS:
-                self._moments.event(self._slot, "note", f"{parameter.name} cf{text}")
+            if parameter.name in PROCESS_COMMANDS:
+                self._builder.add_event(self._slot, "note", f"{parameter.name} cf{text}")
             else:
-                self._moments.event(self._slot, "air", f"{str(parameter.name)[:40]} is {text} from now on")
+                self._builder.add_event(self._slot, "air", f"{str(parameter.name)[:40]} is {text} from now on")
 
     def finish(self, state: str) -> None:
-        """Hand over the last moment; `state` says to people why no more will come."""
+        """Add the last moment; `state` tells people why no more will come."""
         if self._run is not None and self._slot:
-            self._hand_over(self._slot)
-        self._track.end(f"{state}: {self._ended}" if getattr(self, "_ended", "") else state)
+            self._add_moment(self._slot)
+        self._history.state = f"{state}: {self._end_reason}" if self._end_reason else state
 
     _HANDLERS: Mapping[str, Callable[[Follower, Any], None]] = {
         "Slot": _receive_slot,

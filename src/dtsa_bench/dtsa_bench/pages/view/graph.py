@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import time
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 from builtin_interfaces.msg import Duration
-from dtsa_msgs.msg import Configuration, Decision, Reception, RunStatus, Slot
+from dtsa_msgs.msg import Configuration, Decision, Reception, RunStatus, Slot, Status
 from dtsa_msgs.srv import Land
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import SetParameters
@@ -16,7 +19,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Empty
 from visualization_msgs.msg import MarkerArray
@@ -29,33 +32,43 @@ from dtsa_agent.ros.common.wire.intake import Intake
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 
 from .follower import Follower
-from .orders import Order
-from .track import Track
-from .vehicles import VehicleWatch, listening
+from .history import RunHistory, VehicleStates
+from .page_commands import PageCommand
 
 _POLL_S = 0.02
-_VEHICLES_S = 0.05  # wall time from one look at the vehicles to the next
-_WAITING = 500  # messages that wait for the next poll
+_VEHICLES_S = 0.05  # wall time between polls of the vehicles
+_MAX_WAITING = 500  # messages that wait for the next poll
 _ENDED = 2  # RunStatus.ENDED
-_MOST_ORDERS = 20  # that wait
+_MAX_COMMANDS = 20  # that wait
 _ANSWER_S = 5.0
 _LAND_S = 3
+_STATUS_TYPE = "dtsa_msgs/msg/Status"
+_SEARCH_S = 1.0  # between searches of the graph for vehicles
+_MAX_VEHICLES = 200
+_SILENT_S = 2.0  # the bridge publishes the status of each five times a second
+_STATE_LENGTH, _REASON_LENGTH = 20, 80  # characters that are shown
+
+VehicleRow = tuple[str, str, float, float, str]  # as in `VehicleStates`
+
+
+def _listening(depth: int) -> QoSProfile:
+    """QoS of a listener that no publisher waits for; `depth`: messages that wait for it, of more the last."""
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class GraphSource:
     """Follows the swarm of a namespace, run after run.
 
-    :param track: where the moments go.
     :param domain: ROS domain; None: that of the environment.
     :param space: namespace of the swarm.
-    :param control: whether orders are carried out.
+    :param control: whether commands of a page are carried out.
     """
 
     def __init__(
-        self, track: Track, domain: int | None = None, space: str = names.SWARM, control: bool = False
+        self, history: RunHistory, domain: int | None = None, space: str = names.SWARM, control: bool = False
     ) -> None:
-        self._track, self._space = track, space
-        limit_to_machine(os.environ, shared_memory=False)  # who is killed beside it does not take it along
+        self._history, self._space = history, space
+        limit_to_machine(os.environ, shared_memory=False)  # a process that is killed beside it does not block it
         self._context = Context()
         init_ros(None, self._context, domain)
         self._node = Node(
@@ -64,33 +77,34 @@ class GraphSource:
         self._intake = Intake(self._node.get_logger())
         self._settings = self._feed(Configuration, f"{space}/{names.CONFIGURATION}", names.latched_qos())
         self._status = self._feed(RunStatus, f"{space}/{names.STATUS}", names.latched_qos())
-        self._changes = self._feed(ParameterEvent, "/parameter_events", listening(_WAITING))
-        self._markers = self._feed(MarkerArray, f"{space}/{names.MARKERS}", listening(_WAITING))
-        kinds = ((Slot, names.SLOT), (Decision, names.DECISION), (Reception, names.RECEPTION))
-        self._slots = [self._feed(kind, f"{space}/{topic}", listening(_WAITING)) for kind, topic in kinds]
-        self._kept: list[tuple[int, int, Any]] = []  # messages of the newest slot, which may not be complete
-        self._vehicles = VehicleWatch(self._node, self._intake, track, names.swarm_prefix(space))
-        self._orders = _Orders(self._node, self._context, space) if control else None
+        waiting = _listening(_MAX_WAITING)
+        self._changes = self._feed(ParameterEvent, "/parameter_events", waiting)
+        self._markers = self._feed(MarkerArray, f"{space}/{names.MARKERS}", waiting)
+        topics = ((Slot, names.SLOT), (Decision, names.DECISION), (Reception, names.RECEPTION))
+        self._slots = [self._feed(message_type, f"{space}/{topic}", waiting) for message_type, topic in topics]
+        self._pending: list[tuple[int, int, Any]] = []  # messages of the newest slot, which may not be complete
+        self._vehicles = VehicleWatch(self._node, self._intake, history, names.swarm_prefix(space))
+        self._commands = _Commands(self._node, self._context, space) if control else None
         self._run = 0
         self._follower: Follower | None = None
         self.stopped = False
 
-    def _feed(self, kind: Any, topic: str, qos: QoSProfile) -> Feed:
-        return Feed(self._node, kind, topic, qos, intake=self._intake)
+    def _feed(self, message_type: Any, topic: str, qos: QoSProfile) -> Feed:
+        return Feed(self._node, message_type, topic, qos, intake=self._intake)
 
     def run(self) -> None:
-        """Listens until ``stopped`` is set."""
-        self._track.end("waiting for a swarm")
-        look = 0.0
+        """Listen until ``stopped`` is set."""
+        self._history.state = "waiting for a swarm"
+        next_poll_s = 0.0
         try:
             while not self.stopped and self._context.ok():
                 self._follow_runs()
-                if (now := time.monotonic()) >= look:
-                    look = now + _VEHICLES_S
-                    self._vehicles.look(now)
+                if (now := time.monotonic()) >= next_poll_s:
+                    next_poll_s = now + _VEHICLES_S
+                    self._vehicles.poll(now)
                 if self._follower is not None:
                     self._receive(self._follower)
-                for text in self._orders.carry_out() if self._orders else ():
+                for text in self._commands.carry_out() if self._commands else ():
                     self._vehicles.answer = text
                     if self._follower is not None:
                         self._follower.note(text)
@@ -100,28 +114,28 @@ class GraphSource:
             self._vehicles.close()
             for feed in (self._settings, self._status, self._changes, self._markers, *self._slots):
                 feed.close()
-            if self._orders:
-                self._orders.close()
+            if self._commands:
+                self._commands.close()
             self._node.destroy_node()
             self._context.try_shutdown()
 
-    def order(self, order: Order) -> str:
-        """Accept an order; what has come of it stands among the events.
+    def command(self, command: PageCommand) -> str:
+        """Accept a command; its result appears among the events.
 
         :raises ConfigError: if it cannot be one.
         """
-        if self._orders is None:
-            raise ConfigError("order", order.kind, "only with --control")
-        return self._orders.accept(order)
+        if self._commands is None:
+            raise ConfigError("command", command.kind, "only with --control")
+        return self._commands.accept(command)
 
     def _follow_runs(self) -> None:
         """Receive which run is under way, and how it is doing."""
         message = self._settings.take()
         if message is not None and message.run != self._run:
-            self._run, self._kept = message.run, []
-            self._follower = Follower(self._track, {"live": True, "control": self._orders is not None})
+            self._run, self._pending = message.run, []
+            self._follower = Follower(self._history, {"live": True, "control": self._commands is not None})
             self._follower.receive("Configuration", message)
-            if not self._follower.begun:
+            if not self._follower.has_settings:
                 self._follower = None
                 return
         status = self._status.take()
@@ -133,9 +147,9 @@ class GraphSource:
                 self._follower.finish("ended")
 
     def _receive(self, follower: Follower, last: bool = False) -> None:
-        """Receive what has come since the last poll: of each slot decisions and frames before the verdict.
+        """Receive the messages since the last poll: of each slot decisions and frames before the outcome.
 
-        :param last: nothing more will come: the newest slot is complete, too.
+        :param last: no more will come: the newest slot is complete, too.
         """
         while (event := self._changes.take()) is not None:
             if event.node == f"{self._space}/channel":
@@ -143,78 +157,133 @@ class GraphSource:
         while (markers := self._markers.take()) is not None:
             follower.receive("MarkerArray", markers)
         for place, feed in enumerate(self._slots):
-            for _ in range(_WAITING):
+            for _ in range(_MAX_WAITING):
                 message = feed.take()
                 if message is None:
                     break
                 if message.run == self._run:
                     slot = message.heard_slot if place == 0 else message.slot
-                    self._kept.append((slot, place, message))
-        self._kept.sort(key=lambda entry: entry[:2])
-        newest = self._kept[-1][0] if self._kept else 0
-        complete = [entry for entry in self._kept if last or entry[0] < newest]
-        del self._kept[: len(complete)]
+                    self._pending.append((slot, place, message))
+        self._pending.sort(key=lambda entry: entry[:2])
+        newest = self._pending[-1][0] if self._pending else 0
+        complete = [entry for entry in self._pending if last or entry[0] < newest]
+        del self._pending[: len(complete)]
         for _, _, message in complete:
             follower.receive(type(message).__name__, message)
 
 
-class _Orders:
-    """Carries out orders by the services of the channel's node and of the bridge.
+@dataclass(slots=True)
+class _Vehicle:
+    feed: Feed
+    heard_s: float  # time.monotonic() of the last status
+    row: VehicleRow | None = None
 
-    :param node: calls them.
-    :param context: its context.
-    :param space: namespace of the swarm.
-    """
+    def row_now(self, now: float) -> VehicleRow | None:
+        """Return its last status, or "silent" where that is long ago."""
+        if self.row is None or now - self.heard_s <= _SILENT_S:
+            return self.row
+        name, state, battery, _, _ = self.row
+        return name, f"silent ({state})"[:_STATE_LENGTH], battery, 0.0, "the bridge reports nothing of it"
+
+
+class VehicleWatch:
+    """Finds the vehicles of a bridge, whose names have a prefix, as ``/north``, and adds them to a history."""
+
+    def __init__(self, node: Node, intake: Intake, history: RunHistory, prefix: str = "") -> None:
+        self._node, self._intake, self._history = node, intake, history
+        self._topic = re.compile(f"{re.escape(prefix)}/([A-Za-z][A-Za-z0-9_]{{0,40}})/{names.STATUS}")
+        self._vehicles: dict[str, _Vehicle] = {}
+        self._search_s = 0.0
+        self.answer = ""  # result of the last command
+
+    def poll(self, now: float) -> None:
+        """Receive statuses, and search for new vehicles; `now`: s, ``time.monotonic()``."""
+        if now >= self._search_s:
+            self._search_s = now + _SEARCH_S
+            self._search(now)
+        for name, vehicle in self._vehicles.items():
+            message = vehicle.feed.take()
+            if message is not None and math.isfinite(message.battery_voltage) and math.isfinite(message.link_quality):
+                numbers = round(message.battery_voltage, 2), round(message.link_quality, 2)
+                vehicle.row = name, message.state_name[:_STATE_LENGTH], *numbers, message.reason[:_REASON_LENGTH]
+                vehicle.heard_s = now
+        rows = [vehicle.row_now(now) for vehicle in self._vehicles.values()]
+        states = VehicleStates(tuple(row for row in rows if row is not None), self.answer)
+        if states.rows and states != self._history.vehicles:
+            self._history.vehicles = states
+
+    def _search(self, now: float) -> None:
+        vehicles = dict(self._vehicles)
+        for topic, types in self._node.get_topic_names_and_types():
+            match = self._topic.fullmatch(topic) if _STATUS_TYPE in types else None
+            if match and match[1] not in vehicles and len(vehicles) < _MAX_VEHICLES:
+                feed = Feed(self._node, Status, topic, _listening(1), intake=self._intake)
+                vehicles[match[1]] = _Vehicle(feed, now)
+        self._vehicles = {name: vehicles[name] for name in sorted(vehicles, key=_by_number)}
+
+    def close(self) -> None:
+        """Stop listening."""
+        for vehicle in self._vehicles.values():
+            vehicle.feed.close()
+
+
+def _by_number(name: str) -> tuple[str, int]:
+    letters = name.rstrip("0123456789")
+    return letters, int(name[len(letters) :] or 0)
+
+
+class _Commands:
+    """Carries out commands by the services of the channel's node and of the bridge."""
 
     def __init__(self, node: Node, context: Context, space: str) -> None:
         self._channel = node.create_client(SetParameters, f"{space}/channel/set_parameters")
         self._land = node.create_client(Land, "/all/land")
         self._stop = node.create_client(Empty, "/all/emergency")
-        self._waiting: deque[Order] = deque(maxlen=_MOST_ORDERS)
-        self._asked: list[tuple[str, float, Future]] = []  # what, until when, its answer
+        self._waiting: deque[PageCommand] = deque(maxlen=_MAX_COMMANDS)
+        self._calls: list[tuple[str, float, Future]] = []  # text, deadline, answer
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(node)
 
-    def accept(self, order: Order) -> str:
-        """Accept an order; called by the server's thread."""
-        self._waiting.append(order)
-        return f"ordered: {order.kind}"
+    def accept(self, command: PageCommand) -> str:
+        """Accept a command; called by the server's thread."""
+        self._waiting.append(command)
+        return f"ordered: {command.kind}"
 
     def carry_out(self) -> list[str]:
-        """Call what is ordered, never wait; what has come of orders, as people read it."""
+        """Call the services without waiting; return the results that are there, as people read them."""
         results = []
         while self._waiting:
-            order = self._waiting.popleft()
-            client, request = self._request(order)
-            text = f"{order.kind} {order.value!r}" if client is self._channel else order.kind
+            command = self._waiting.popleft()
+            client, request = self._request(command)
+            text = f"{command.kind} {command.value!r}" if client is self._channel else command.kind
             if not client.service_is_ready():
                 results.append(f"refused: {text}: no node offers {client.srv_name}")
             else:
-                self._asked.append((text, time.monotonic() + _ANSWER_S, client.call_async(request)))
-        if self._asked:
+                self._calls.append((text, time.monotonic() + _ANSWER_S, client.call_async(request)))
+        if self._calls:
             self._executor.spin_once(timeout_sec=0.0)
-        for entry in list(self._asked):
-            text, until, future = entry
-            if future.done() or time.monotonic() > until:
-                self._asked.remove(entry)
+        for call in list(self._calls):
+            text, deadline, future = call
+            if future.done() or time.monotonic() > deadline:
+                self._calls.remove(call)
                 results.append(f"{text}: {_answer_text(future.result()) if future.done() else 'no answer'}")
         return results
 
-    def _request(self, order: Order) -> tuple[Any, Any]:
-        if order.kind == "land":
+    def _request(self, command: PageCommand) -> tuple[Any, Any]:
+        if command.kind == "land":
             return self._land, Land.Request(height=0.0, duration=Duration(sec=_LAND_S))
-        if order.kind == "emergency":
+        if command.kind == "emergency":
             return self._stop, Empty.Request()
-        parameter = Parameter(order.kind, value=order.value).to_parameter_msg()
+        parameter = Parameter(command.kind, value=command.value).to_parameter_msg()
         return self._channel, SetParameters.Request(parameters=[parameter])
 
     def close(self) -> None:
-        """Gives the handles back."""
+        """Release the executor."""
         self._executor.shutdown(timeout_sec=0)
 
 
 def _answer_text(response: Any) -> str:
-    """What a service has answered, in words."""
+    """Answer of a service, in words."""
     results = getattr(response, "results", None)
     if results is not None:
         return "done" if results and results[0].successful else f"refused: {results[0].reason if results else '?'}"

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,6 @@ from dtsa_bench.runs.processes import end_process
 
 _START_S = 30.0
 _END_S = 5.0
-_NICE = 10
 # A process group of its own: Ctrl-C in the terminal reaches the flight alone, which then ends the page.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
 
@@ -33,15 +32,14 @@ class PageOptions:
 
 @contextmanager
 def view_process(domain: int, environment: Mapping[str, str], page: PageOptions) -> Iterator[subprocess.Popen[str]]:
-    """Serve a page for as long as the context lasts, and print its address; no flight depends on it.
+    """Serve a page of a ROS domain while the context lasts, and print its address; no flight depends on it.
 
-    :param domain: ROS domain.
     :param environment: further variables of its process.
     :raises DtsaError: if it does not start.
     """
-    words = ["view", "--domain", str(domain), "--port", str(page.port), *(["--control"] if page.control else [])]
+    arguments = ["view", "--domain", str(domain), "--port", str(page.port), *(["--control"] if page.control else [])]
     process = subprocess.Popen(
-        [sys.executable, "-m", "dtsa_bench", *words],
+        [sys.executable, "-m", "dtsa_bench", *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,
@@ -61,9 +59,3 @@ def view_process(domain: int, environment: Mapping[str, str], page: PageOptions)
     finally:
         end_process(process, _END_S, signal.SIGTERM)
         process.stdout.close()
-
-
-def give_way() -> None:
-    """Let whatever flies on this machine go first."""
-    with suppress(OSError):
-        os.nice(_NICE)

@@ -19,23 +19,22 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.pages.html import PALETTE, SCRIPTS, asset, render_page
 
-from .moments import BELIEFS
-from .orders import Order, read_order
-from .track import Track, Vehicles
+from .history import MAX_BELIEVERS, RunHistory, VehicleStates
+from .page_commands import PageCommand, parse_command
 
 LOOPBACK = "127.0.0.1"
 RATE_HZ = 20.0  # messages a second to one page, at most
 BATCH = 200  # moments in one message
-MOST_PAGES = 16
+MAX_PAGES = 16
 _STYLES = ("style.css", "view.css")
 _ASSETS = {
     **dict.fromkeys((*SCRIPTS, "run.js", "panels.js", "view.js"), "text/javascript"),
     **dict.fromkeys(_STYLES, "text/css"),
 }
-_LONGEST_ORDER = 4096  # bytes
-_PATIENCE_S = 60.0  # a page that reads nothing for so long is let go
-_ORDERS_PER_S = 20.0
-_GOODBYE_S = 2.0  # for one page to be let go
+_MAX_MESSAGE = 4096  # bytes, of a page
+_SEND_TIMEOUT_S = 60.0  # a page that reads nothing for so long is disconnected
+_MESSAGES_PER_S = 20.0  # of a page
+_CLOSE_S = 2.0  # for one page to disconnect
 _POLICY = "Content-Security-Policy"
 _HEADERS = {
     _POLICY: "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -51,25 +50,22 @@ _HEADERS = {
 class ViewServer:
     """Serves a page that shows a run.
 
-    :param track: the run.
-    :param token: what stands in the address; a request without it gets nothing.
-    :param order: accepts what the page orders; None: the page may order nothing.
+    :param token: part of the address; a request without it gets nothing.
+    :param command: accepts commands of a page; None: pages may not command.
     """
 
-    def __init__(self, track: Track, token: str, order: Callable[[Order], str] | None = None) -> None:
-        self._track, self._token, self._order = track, token, order
-        self._pages: dict[web.WebSocketResponse, _Reader] = {}
+    def __init__(self, history: RunHistory, token: str, command: Callable[[PageCommand], str] | None = None) -> None:
+        self._history, self._token, self._command = history, token, command
+        self._pages: dict[web.WebSocketResponse, _PageStream] = {}
         self._hosts: set[str] = set()
-        self.application = web.Application(middlewares=[self._guard], client_max_size=_LONGEST_ORDER)
+        self.application = web.Application(middlewares=[self._guard], client_max_size=_MAX_MESSAGE)
         self.application.router.add_get("/{token}/", self._page)
         self.application.router.add_get("/{token}/stream", self._stream)
         self.application.router.add_get("/{token}/{name}", self._asset)
 
     async def start(self, port: int = 0, address: str = LOOPBACK) -> str:
-        """Begin to listen; return the address of the page, with its token.
+        """Start to listen on an address of this machine (port 0: any); return the address of the page.
 
-        :param port: 0: any that is free.
-        :param address: of this machine; connections to it are accepted.
         :raises ConfigError: if the port cannot be had.
         """
         self._runner = web.AppRunner(self.application, access_log=None, handle_signals=False, shutdown_timeout=1.0)
@@ -89,17 +85,16 @@ class ViewServer:
         self._hosts = {f"{name}:{bound}" for name in {shown, LOOPBACK, "localhost"}}
         return f"http://{shown}:{bound}/{self._token}/"
 
-    async def stop(self, patience_s: float = 0.0) -> None:
-        """Let all pages go, and end.
-
-        :param patience_s: s, for pages to receive what they do not have yet.
-        """
-        deadline = time.monotonic() + patience_s
-        while time.monotonic() < deadline and any(reader.behind for reader in self._pages.values()):
+    async def stop(self, wait_s: float = 0.0) -> None:
+        """Disconnect all pages, and end; `wait_s`: for pages to receive what they do not have yet."""
+        deadline = time.monotonic() + wait_s
+        for stream in self._pages.values():
+            stream.is_behind = True  # until it has found nothing more to send
+        while time.monotonic() < deadline and any(stream.is_behind for stream in self._pages.values()):
             await asyncio.sleep(0.02)
         for page in list(self._pages):
             with suppress(Exception):
-                await asyncio.wait_for(page.close(code=WSCloseCode.GOING_AWAY, message=b"the end"), _GOODBYE_S / 2)
+                await asyncio.wait_for(page.close(code=WSCloseCode.GOING_AWAY, message=b"the end"), _CLOSE_S / 2)
         await self._runner.cleanup()
 
     @web.middleware
@@ -120,11 +115,8 @@ class ViewServer:
         return response
 
     async def _page(self, _: web.Request) -> web.Response:
-        data = {"runs": [], "palette": PALETTE, "reasons": dict(REASON_TEXTS), "control": self._order is not None}
-        page = render_page(
-            "page.html", served=True, kind="view", title="DTSA, live", styles=_STYLES,
-            scripts=(*SCRIPTS, "view.js"), data=data,
-        )  # fmt: skip
+        data = {"runs": [], "palette": PALETTE, "reasons": dict(REASON_TEXTS), "control": self._command is not None}
+        page = render_page("view", "DTSA, live", (*SCRIPTS, "view.js"), data, styles=_STYLES, served=True)
         return web.Response(text=page, content_type="text/html")
 
     async def _asset(self, request: web.Request) -> web.Response:
@@ -136,129 +128,115 @@ class ViewServer:
     async def _stream(self, request: web.Request) -> web.StreamResponse:
         if request.headers.get("Origin") is None and request.headers.get("Sec-Fetch-Site") not in (None, "same-origin"):
             return web.Response(status=403, text="not allowed\n")
-        if len(self._pages) >= MOST_PAGES:
+        if len(self._pages) >= MAX_PAGES:
             return web.Response(status=503, text="too many pages\n")
-        page = web.WebSocketResponse(max_msg_size=_LONGEST_ORDER, heartbeat=30.0, compress=False)
+        page = web.WebSocketResponse(max_msg_size=_MAX_MESSAGE, heartbeat=30.0, compress=False)
         await page.prepare(request)
-        reader = self._pages[page] = _Reader(page, self._track)
-        sending = asyncio.create_task(reader.run())
+        stream = self._pages[page] = _PageStream(page, self._history)
+        sending = asyncio.create_task(stream.run())
         try:
-            await self._listen(page, reader)
+            await self._listen(page, stream)
         finally:
-            await reader.end(sending)
+            await stream.end(sending)
             self._pages.pop(page, None)
         return page
 
-    async def _listen(self, page: web.WebSocketResponse, reader: _Reader) -> None:
-        """Receive what a page asks for, a few times a second."""
+    async def _listen(self, page: web.WebSocketResponse, stream: _PageStream) -> None:
+        """Receive messages of a page, a few times a second."""
         async for message in page:
             if message.type != WSMsgType.TEXT:
                 break
             try:
                 content = json.loads(message.data)
                 if isinstance(content, dict) and "ghosts" in content:
-                    reader.choose(content["ghosts"])
-                elif isinstance(content, dict) and "order" in content:
-                    reader.answer = self._accept(content["order"])
+                    stream.choose(content["ghosts"])
+                elif isinstance(content, dict) and "command" in content:
+                    stream.answer = self._accept(content["command"])
             except (ValueError, TypeError, RecursionError):
                 break  # not our page
-            await asyncio.sleep(1 / _ORDERS_PER_S)
+            await asyncio.sleep(1 / _MESSAGES_PER_S)
 
     def _accept(self, content: Any) -> str:
-        if self._order is None:
+        if self._command is None:
             return "refused: started without --control"
         try:
-            return self._order(read_order(content))
+            return self._command(parse_command(content))
         except DtsaError as error:
             return f"refused: {error}"
 
 
-class _Reader:
-    """What one page has been sent; it gets the next moments when it has read the last ones.
+class _PageStream:
+    """What one page has been sent; it gets the next moments when it has read the last ones."""
 
-    :param page: the connection.
-    :param track: the run.
-    """
-
-    def __init__(self, page: web.WebSocketResponse, track: Track) -> None:
-        self._page, self._track = page, track
+    def __init__(self, page: web.WebSocketResponse, history: RunHistory) -> None:
+        self._page, self._history = page, history
         self._run = 0  # number of the run that the page knows
         self._next = 0  # first moment that it does not have
         self._state = "-"
-        self._vehicles: Vehicles | None = None  # that the page knows
-        self._chosen = 0  # agent whose beliefs it wants
+        self._vehicles: VehicleStates | None = None  # that the page knows
+        self._chosen = 0  # agent whose beliefs it shows
         self._next_belief = 0
-        self.answer = ""  # to its last order
+        self.answer = ""  # to its last command
+        self.is_behind = True  # whether there may be something that the page has not been sent
         self._ended = False
 
     def choose(self, agent: int) -> None:
-        """The page wants to see what an agent (id; 0: none) believes; other numbers are ignored."""
-        info = self._track.info[1]
-        if info and 0 <= int(agent) <= min(info["agents"], BELIEFS):
+        """Send what an agent (id; 0: none) believes from now on; other numbers are ignored."""
+        info = self._history.info[1]
+        if info and 0 <= int(agent) <= min(info["agents"], MAX_BELIEVERS):
             self._chosen, self._next_belief = int(agent), 0
 
     async def run(self) -> None:
-        """Send what is new until the page goes."""
+        """Send what is new until the page disconnects."""
         try:
             while not self._page.closed and not self._ended:
-                for content in self._updates():
-                    await self._send(content)
-                if self.answer:
-                    content, self.answer = json.dumps({"kind": "answer", "text": self.answer}), ""
-                    await self._send(content)
-                await asyncio.sleep(1 / RATE_HZ if not self.behind else 0.0)
+                updates = self._updates()
+                for content in updates:  # waits until the page has received it, or for a minute at most
+                    await asyncio.wait_for(self._page.send_str(content), _SEND_TIMEOUT_S)
+                self.is_behind = bool(updates)
+                await asyncio.sleep(0.0 if updates else 1 / RATE_HZ)
         finally:  # the page may connect again
             with suppress(Exception):
-                await asyncio.wait_for(self._page.close(), _GOODBYE_S / 2)
+                await asyncio.wait_for(self._page.close(), _CLOSE_S / 2)
 
     async def end(self, running: asyncio.Task[None]) -> None:
-        """End the task of `run`, which may be anywhere."""
+        """End the task of `run`, at whatever step it is."""
         self._ended = True  # before Python 3.12, wait_for drops a cancellation when what it waits for is just done
         running.cancel()
-        ended, _ = await asyncio.wait({running}, timeout=_GOODBYE_S)
+        ended, _ = await asyncio.wait({running}, timeout=_CLOSE_S)
         for task in ended:
             if not task.cancelled():
                 task.exception()  # a page that has gone is no error
 
-    @property
-    def behind(self) -> bool:
-        """Whether there is something that the page has not been sent."""
-        if self._track.info[1] is None:
-            return False
-        if self._track.since(self._next, 1)[1] or self._track.state != self._state:
-            return True
-        return bool(self._chosen and self._track.since(self._next_belief, 1)[1])
-
-    async def _send(self, text: str) -> None:
-        """Wait until the page has received it, or for a minute at most."""
-        await asyncio.wait_for(self._page.send_str(text), _PATIENCE_S)
-
     def _updates(self) -> list[str]:
-        track = self._track
+        history = self._history
         updates: list[str] = []
-        if (vehicles := track.vehicles) is not self._vehicles and vehicles is not None:
+        if self.answer:
+            updates.append(json.dumps({"kind": "answer", "text": self.answer}))
+            self.answer = ""
+        if (vehicles := history.vehicles) is not self._vehicles and vehicles is not None:
             self._vehicles = vehicles
             updates.append(json.dumps({"kind": "vehicles", "rows": vehicles.rows, "answer": vehicles.answer}))
-        number, info = track.info
+        number, info = history.info
         if info is None:
             return updates
         if number != self._run:
             self._run, self._next_belief, self._state = number, 0, "-"
             updates.append(json.dumps({"kind": "begin", "info": info}))
-        first, moments = track.since(self._next, BATCH)
+        first, moments = history.since(self._next, BATCH)
         if moments:
             self._next = first + len(moments)
             body = ",".join(moment.text for moment in moments)
             updates.append(f'{{"kind":"moments","first":{first},"moments":[{body}]}}')
-        elif track.state != self._state:
-            self._state = track.state
-            updates.append(json.dumps({"kind": "state", "text": track.state}))
+        elif history.state != self._state:
+            self._state = history.state
+            updates.append(json.dumps({"kind": "state", "text": history.state}))
         if self._chosen:
             updates += self._beliefs(info["agents"])
         return updates
 
     def _beliefs(self, agents: int) -> list[str]:
-        first, moments = self._track.since(self._next_belief, BATCH)
+        first, moments = self._history.since(self._next_belief, BATCH)
         moments = moments[: max(0, self._next - first)]
         if not moments:
             return []
