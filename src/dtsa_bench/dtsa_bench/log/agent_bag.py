@@ -87,7 +87,6 @@ class RecordFile:
             "configuration": json.dumps(settings, sort_keys=True), **custom,
         }  # fmt: skip
         self._definition = schema.installed(TYPE)
-        self._profiles = metadata.resolve_profiles("reliable")
         try:
             self._stream = path.open("xb")
             self._mcap = Writer(self._stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
@@ -96,7 +95,7 @@ class RecordFile:
         except OSError as error:
             raise BagError(f"cannot record to {path}: {error.strerror or error}") from error
         channel = {
-            "offered_qos_profiles": metadata.dump_profiles(self._profiles),
+            "offered_qos_profiles": metadata.dump_profiles([metadata.PROFILES["reliable"]]),
             "topic_type_hash": self._definition.type_hash,
         }
         number = self._mcap.register_schema(TYPE, "ros2msg", self._definition.text.encode())
@@ -104,8 +103,13 @@ class RecordFile:
         self._next_flush = monotonic() + _FLUSH_S
 
     def _add_metadata(self) -> None:
-        topic = metadata.TopicSummary(SLOT_RECORD, TYPE, self._profiles, self._definition.type_hash, self._count)
-        content = metadata.build(self.path.name, [topic], *self._times, self.custom)
+        start_ns, end_ns = self._times
+        content = {
+            "version": metadata.VERSION, "storage_identifier": "mcap", "message_count": self._count,
+            "starting_time": {"nanoseconds_since_epoch": start_ns}, "duration": {"nanoseconds": end_ns - start_ns},
+            "compression_format": "", "compression_mode": "", "relative_file_paths": [self.path.name],
+            "custom_data": self.custom, "ros_distro": "jazzy",
+        }  # fmt: skip
         self._mcap.add_metadata(metadata.RECORD_NAME, {metadata.RECORD_KEY: metadata.dump(content)})
 
     def write(self, time_ns: int, data: bytes) -> None:
