@@ -31,7 +31,7 @@ from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.merge.merge import Merge, verified
 from dtsa_bench.log.merge.timeline import Crossing, fit
 from dtsa_bench.log.merged_bag import align, write_merged
-from dtsa_bench.log.record import SLOT_RECORD
+from dtsa_bench.log.record import SLOT_RECORD, load_log
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
 
@@ -51,7 +51,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     stranger = UdpPort(udp)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DTSA_AUTH_KEY", KEY)
-        sniffing = helpers.Sniffing(CONFIG, udp)
+        sniffing = helpers.Sniffing(CONFIG, udp, directory / "sniffed.mcap")
         try:
             with helpers.listening(CONFIG, udp) as told, helpers.flying(CONFIG, [udp] * 3, directory, own) as flying:
                 helpers.hear_each_other(flying, 10)
@@ -108,6 +108,10 @@ def test_groups_become_one_flight_on_one_time_line_in_which_all_keep_the_rules(f
     assert found["frames_judged"] > 10
     assert (found["rules_broken"], found["slots_with_two_senders"]) == (0, 0), found["which"]
     assert {"not ours", "other settings", "rejected", "repeated"} <= found["not_taken_in"].keys()
+    heard = load_log(flight.bags[0].with_name("sniffed.mcap"))
+    assert int(heard.sent.sum()) == sum(found["heard"].values())
+    assert not heard.known.any()
+    assert verify_bag(flight.bags[0].with_name("sniffed.mcap")).ok
     for summary in flight.summaries.values():
         found = summary["not_taken_in"]
         assert found["not ours"] >= 2

@@ -1,0 +1,94 @@
+"""The log of a flight: simulated and recorded it is the same, and what is no log of this format is refused."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from bag_helpers import definition, flight_bag
+
+import dtsa
+from dtsa_bench.commands.cli import main
+from dtsa_bench.log.bag.errors import UnusableBag
+from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.log.record import load_log
+from dtsa_bench.log.tables import COLUMNS, table
+from dtsa_bench.log.verify.check import verify_bag
+from dtsa_bench.runs.config import RunConfig
+
+ARRAYS = ("outcome", "length", "lost", "collided", "chosen", "reason", "digest", "score", "velocity", "command", "goal")
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without losses: the simulator flies the same."""
+    path = tmp_path_factory.mktemp("log") / "bag"
+    flight_bag(path, slots=150, agents=5, moving=3, policy="lease", seed=4)
+    return path
+
+
+def test_a_recorded_flight_has_the_arrays_of_the_simulated_one(bag: Path) -> None:
+    recorded = load_log(bag)
+    simulated = dtsa.simulate(RunConfig.from_dict(recorded.settings))
+    assert len(recorded) == 150 <= len(simulated)
+    for name in ARRAYS:
+        assert np.array_equal(getattr(recorded, name), getattr(simulated, name)[:150]), name
+    assert np.array_equal(recorded.track, simulated.track[:151])
+    frames = recorded.sent_frames
+    assert frames.data == simulated.sent_frames.data[: len(frames.data)]
+    assert np.array_equal(frames.received, simulated.received[: len(frames.data)])
+    assert recorded.known.all()
+    assert np.array_equal(recorded.position[3, -1], recorded.track[4, -1])
+    for row, sender, data in zip(frames.row.tolist(), frames.sender.tolist(), frames.data, strict=True):
+        assert recorded.frame(row, sender) == data
+
+
+def test_a_log_is_pickled_and_written_as_parquet(bag: Path, tmp_path: Path) -> None:
+    log = load_log(bag)
+    again = pickle.loads(pickle.dumps(log))
+    for name in COLUMNS:
+        assert table(log, name).equals(table(again, name)), name
+    assert again.summary == log.summary
+    files = log.to_parquet(tmp_path / "tables", ["slots", "distances"])
+    assert [path.name for path in files] == ["slots.parquet", "distances.parquet"]
+    assert pd.read_parquet(files[1])["distance_m"].min() == pytest.approx(log.summary["min_distance_m"])
+    assert log.errors["error_m"].equals(log.ages["error_m"])
+
+
+def test_bags_of_format_1_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with BagWriter(tmp_path / "old", {"swarm": {"agents": 3}}) as writer:
+        for topic, kind in (("/swarm/reception", "Reception"), ("/swarm/transmission", "Transmission")):
+            writer.add_topic(topic, f"dtsa_msgs/msg/{kind}", "reliable", definition(f"dtsa_msgs/msg/{kind}"))
+    with pytest.raises(UnusableBag, match="bag format 1, and this version reads format 2"):
+        load_log(tmp_path / "old")
+    with pytest.raises(UnusableBag, match="bag format 1"):
+        verify_bag(tmp_path / "old")
+    for command in ("verify", "report", "export"):
+        assert main([command, str(tmp_path / "old")]) == 2
+        said = capsys.readouterr().err
+        assert "bag format 1" in said
+        assert said.count("\n") == 1
+
+
+def test_records_that_do_not_fit_together_are_one_line(bag: Path, tmp_path: Path) -> None:
+    from dtsa_bench.log.bag.reader import Bag
+    from dtsa_bench.log.record import SLOT_RECORD, TYPE
+
+    def rewritten(name: str, change: str) -> Path:
+        with Bag(bag) as source, BagWriter(tmp_path / name, source.config) as copy:
+            channel = copy.add_topic(SLOT_RECORD, TYPE, "reliable", definition(TYPE))
+            for message, record in source.typed([SLOT_RECORD]):
+                if int(record.slot) == 70:
+                    value = {"slot": 2**31, "agent": record.agent[::-1].copy(), "score": record.score[1:]}[change]
+                    setattr(record, change, value)
+                data = bytes(source.typestore.serialize_cdr(record, TYPE))
+                copy.write(channel, data, message.log_time_ns, message.publish_time_ns)
+        return tmp_path / name
+
+    for change in ("slot", "agent", "score"):
+        with pytest.raises(UnusableBag, match="do not fit together") as caught:
+            load_log(rewritten(change, change))
+        assert "\n" not in str(caught.value)
