@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Metadata
+from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from rosbags.serde import SerdeError
@@ -46,7 +46,7 @@ from dtsa_bench.log.record import (
     cut_frames,
     frame_fields,
     pack_record,
-    unpack_record,
+    record_codec,
 )
 from dtsa_bench.log.bag import metadata, schema
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
@@ -266,6 +266,7 @@ def read(path: str | Path) -> AgentBag:
     file = find_bag(path)
     bag: AgentBag | None = None
     topics: dict[int, str] = {}
+    unpack: Callable[[bytes], Any] | None = None
     is_finished = False
     try:
         if not file.stat().st_size:
@@ -275,11 +276,13 @@ def read(path: str | Path) -> AgentBag:
                 for record in StreamReader(stream, validate_crcs=True, record_size_limit=_LONGEST_RECORD).records:
                     if isinstance(record, Channel):
                         topics[record.id] = record.topic
+                    elif isinstance(record, Schema) and record.name == TYPE:
+                        unpack = record_codec(record.data.decode())
                     elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
                         bag = _read_about(file, record, bag)
-                    elif isinstance(record, Message) and bag is not None:
+                    elif isinstance(record, Message) and bag is not None and unpack is not None:
                         if topics.get(record.channel_id) == SLOT_RECORD:
-                            _add_slot(bag, unpack_record(record.data))
+                            _add_slot(bag, unpack(record.data))
                 is_finished = True
             except UnusableBag:
                 raise

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
+import math
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.base import TypesysError
 
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.packing import pack_received, unpack_received
@@ -96,7 +100,8 @@ def load_log(source: Bag | str | Path) -> FlightLog:
         with Bag(source) as bag:
             return load_log(bag)
     check_format(source)
-    return build_log(source, (source.decode(message) for message in source.messages([SLOT_RECORD])))
+    decode = record_decoder(source)
+    return build_log(source, (decode(message) for message in source.messages([SLOT_RECORD])))
 
 
 def check_format(bag: Bag) -> None:
@@ -221,9 +226,16 @@ class _Rows:
         self._received: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._heard: list[tuple[int, int, int, int, NDArray[np.bool_], bool, bytes]] = []
         self._has_presence = self._own_clocks = False
-        for record in records:
-            if record is not end:
-                self._add(record)
+        told = [record for record in records if record is not end]
+        everybody = np.arange(1, agents + 1)
+        whole = [record for record in told if np.array_equal(record.agent, everybody)]
+        self._add_accounts(whole, slice(None))
+        for record in told:
+            if len(record.agent) != agents:
+                self._add_accounts([record], self._columns(record))
+            row = int(record.slot) - self._first
+            self._add_frames(record, row)
+            self._add_heard(record, row)
         if end is not None:
             self._end(end)
         self.has_end = end is not None
@@ -239,27 +251,37 @@ class _Rows:
         track = self._arrays["track"]
         track[int(record.slot) - self._first][:, :, at] = record.track.reshape(track.shape[1], 3, len(at))
 
-    def _add(self, record: Any) -> None:
-        arrays, row, at = self._arrays, int(record.slot) - self._first, self._columns(record)
-        count, steps = len(at), arrays["track"].shape[1]
-        arrays["recorded"][row], arrays["outcome"][row] = True, min(int(record.outcome), UNKNOWN)
-        stamp = record.header.stamp
-        arrays["start_ns"][row] = int(stamp.sec) * _SECOND + int(stamp.nanosec) - names.TIME_ZERO_NS
-        arrays["known"][row, at] = True
+    def _add_accounts(self, records: Sequence[Any], at: Any) -> None:
+        """What agents, in these columns, told of slots."""
+        if not records:
+            return
+        arrays, count, steps = self._arrays, len(records[0].agent), self._arrays["track"].shape[1]
+        rows = np.array([int(record.slot) - self._first for record in records])
+
+        def put(name: str, shape: tuple[int, ...], index: Any) -> None:
+            size = math.prod(shape)
+            values = [getattr(record, name) for record in records]
+            for record, found in zip(records, values, strict=True):
+                if len(found) != size:
+                    raise ValueError(f"slot {record.slot}: {len(found)} entries in {name}, {count} agents")
+            arrays[name][index] = np.concatenate(values).reshape(len(rows), *shape)
+
+        own = (rows, at) if isinstance(at, slice) else (rows[:, None], at)
+        arrays["recorded"][rows], arrays["known"][own] = True, True
+        arrays["outcome"][rows] = [min(int(record.outcome), UNKNOWN) for record in records]
+        stamps = [(int(record.header.stamp.sec), int(record.header.stamp.nanosec)) for record in records]
+        arrays["start_ns"][rows] = [sec * _SECOND + ns - names.TIME_ZERO_NS for sec, ns in stamps]
         for name in _DECIDED:
-            values = getattr(record, name)
-            if len(values) != count:
-                raise ValueError(f"slot {record.slot}: {len(values)} entries in {name}, {count} agents")
-            arrays[name][row, at] = values
-        if len(record.offset_ns):
-            arrays["offset_ns"][row, at] = record.offset_ns
-        arrays["presence"][row, at] = record.presence if len(record.presence) else PRESENT
-        self._has_presence = self._has_presence or len(record.presence) > 0
-        arrays["track"][row][:, :, at] = record.track.reshape(steps, 3, count)
+            put(name, (count,), own)
+        planes = (rows, slice(None), at) if isinstance(at, slice) else (rows[:, None, None], np.arange(3)[:, None], at)
         for name in ("velocity", "command", "goal"):
-            arrays[name][row][:, at] = getattr(record, name).reshape(3, count)
-        self._add_frames(record, row)
-        self._add_heard(record, row)
+            put(name, (3, count), planes)
+        for row, record in zip(rows.tolist(), records, strict=True):
+            arrays["track"][row][:, :, at] = record.track.reshape(steps, 3, count)
+            if len(record.offset_ns):
+                arrays["offset_ns"][row, at] = record.offset_ns
+            arrays["presence"][row, at] = record.presence if len(record.presence) else PRESENT
+            self._has_presence = self._has_presence or len(record.presence) > 0
 
     def _add_frames(self, record: Any, row: int) -> None:
         arrays, senders = self._arrays, record.sender.tolist()
@@ -356,20 +378,31 @@ def _slice(log: FlightLog, first: int, last: int) -> FlightLog:
     return FlightLog(**fields)
 
 
-def unpack_record(data: bytes) -> Any:
-    """A SlotRecord from its CDR, by this version's definition.
+@lru_cache(maxsize=8)
+def record_codec(definition: str) -> Callable[[bytes], Any]:
+    """What makes a SlotRecord of CDR, by the definition that stands beside it.
 
-    :raises Exception: of any kind, as rosbags does, if it is none.
+    :raises UnusableBag: for a definition that is none.
     """
-    return _store().deserialize_cdr(data, TYPE)
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(definition, TYPE))
+    except (TypesysError, SyntaxError) as error:
+        raise UnusableBag(SLOT_RECORD, f"the definition of {TYPE} cannot be used: {error}") from None
+    return lambda data: store.deserialize_cdr(data, TYPE)
 
 
-def decode_record(bag: Bag, message: Message) -> Any:
-    """A record of a bag.
+def record_decoder(bag: Bag) -> Callable[[Message], Any]:
+    """What decodes the records of a bag; it raises BagError for what is none."""
+    topic = bag.topics.get(SLOT_RECORD)
+    if topic is None or topic.type != TYPE:
+        return bag.decode
+    unpack = record_codec(topic.definition)
 
-    :raises BagError: if it is none.
-    """
-    record = bag.decode(message)
-    if message.type != TYPE:
-        raise BagError(f"{message.topic}: {message.type} instead of {TYPE}")
-    return record
+    def decode(message: Message) -> Any:
+        try:
+            return unpack(message.data)
+        except (SerdeError, AssertionError, IndexError, KeyError, ValueError, struct.error) as error:
+            raise BagError(f"{SLOT_RECORD} at {message.log_time_ns} ns: not a valid {TYPE} ({error})") from None
+
+    return decode

@@ -13,7 +13,7 @@ from dtsa_bench.log.bag.cdr import OdometryPacker
 from dtsa_bench.log.bag.metadata import RUN_ID
 from dtsa_bench.log.bag.reader import Bag, Message
 from dtsa_bench.log.bag.writer import KEY, BagDigest
-from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, decode_record
+from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, record_decoder
 
 from .result import Difference, Mismatch, Result
 
@@ -29,6 +29,7 @@ class BagContents:
 
     def __init__(self, bag: Bag, slot_ns: int, agents: int, result: Result) -> None:
         self._bag, self._slot_ns, self._result = bag, slot_ns, result
+        self._decode = record_decoder(bag)
         self.records: list[Any] = []
         self.changes: list[tuple[int, dict[str, Any]]] = []  # slot, values
         self._odometry: list[tuple[int, int, bytes]] = []  # slot, agent, message
@@ -61,7 +62,7 @@ class BagContents:
                 self._odometry.append((slot, int(agent) if agent.isdigit() else 0, message.data))
 
     def _add_record(self, message: Message, run: int) -> None:
-        record = decode_record(self._bag, message)
+        record = self._decode(message)
         slot, stamp = int(record.slot), record.header.stamp
         right = message.log_time_ns if self._partial else names.slot_time_ns(slot, self._slot_ns)
         for what, expected, recorded in (
