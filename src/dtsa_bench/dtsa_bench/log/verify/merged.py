@@ -26,7 +26,7 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
     result.count("slot records", len(log))
     check_merged_receptions(log)
-    check_own_states(log, OwnStates(log.config.swarm, result))
+    check_own_states(log, OwnStates(log.config.swarm, result, tags=False))
     found = from_log(log).judge()
     differences, turns = found["decisions_again"]["differences"], found["turns"]
     if differences:
@@ -46,6 +46,8 @@ def check_merged(log: FlightArrays, result: Result) -> None:
         result.skipped["turns"] = "bags are missing or break off: who was given a turn is not known of all"
     else:
         result.count("frames in turn", turns["frames_judged"])
+    if log.config.swarm.auth:
+        result.skipped["tags of frames"] = "the agents have checked them; they cover more than is recorded"
     result.skipped["motion"] = "each agent has recorded where it was"
     result.skipped["why a frame was not heard"] = "a network does not say"
     result.safety |= {
