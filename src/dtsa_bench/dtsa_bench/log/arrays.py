@@ -210,11 +210,6 @@ class FlightArrays:
         return times[flown], self.track[flown], velocity[flown]
 
     @property
-    def instants_ns(self) -> NDArray[np.int64]:
-        """(T,) ns from the start of slot 0: the control instants of `path`."""
-        return self._instants[0]
-
-    @property
     def instants_s(self) -> Floats:
         """(T,) s from the start of slot 0: the control instants of `path`."""
         return np.asarray(self._instants[0] / 1e9)
