@@ -231,7 +231,7 @@ class _Rows:
         whole = [record for record in told if np.array_equal(record.agent, everybody)]
         self._add_accounts(whole, slice(None))
         for record in told:
-            if len(record.agent) != agents:
+            if not np.array_equal(record.agent, everybody):
                 self._add_accounts([record], self._columns(record))
             row = int(record.slot) - self._first
             self._add_frames(record, row)
