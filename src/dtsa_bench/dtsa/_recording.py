@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.drawing.card import as_html, as_text
-from dtsa_bench.recordings.bag.place import find_file
+from dtsa_bench.recordings.bag.metadata import find_files
 from dtsa_bench.recordings.bag.run import RecordedRun, load_run
 from dtsa_bench.recordings.tables.ages import follow_run
 from dtsa_bench.recordings.tables.export import ages_table, arrow_table
@@ -38,7 +38,7 @@ class Recording:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.file: Path = find_file(path)  # the .mcap file
+        self.file: Path = find_files(path)[0]  # the .mcap file, the first of several
         self._run: RecordedRun = load_run(path)
 
     def __repr__(self) -> str:

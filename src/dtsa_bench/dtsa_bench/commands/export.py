@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export the bag."""
-    from dtsa_bench.recordings.bag.place import bag_of
+    from dtsa_bench.recordings.bag.metadata import bag_of
     from dtsa_bench.recordings.tables.export import export
 
     bag = bag_of(args.bag).resolve()

@@ -24,6 +24,7 @@ from bag_helpers import (
     synthetic_bag,
     synthetic_run,
 )
+from mcap.reader import make_reader
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.recordings.bag import schema
@@ -148,8 +149,8 @@ def test_impossible_rates_starts_and_topics_are_refused(run: SyntheticRun) -> No
 
 def test_a_damaged_chunk_ends_the_playing_with_an_error(run: SyntheticRun, tmp_path: Path) -> None:
     data = bytearray(run.writer.path.read_bytes())
-    with Bag(run.writer.path) as bag:
-        data[bag._chunks[-1].chunk_start_offset + 100] ^= 1
+    with run.writer.path.open("rb") as stream:
+        data[make_reader(stream).get_summary().chunk_indexes[-1].chunk_start_offset + 100] ^= 1
     (tmp_path / "bad.mcap").write_bytes(data)
     with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match="recover"):
         Player(bag, Listener(), rate=100.0).play()
