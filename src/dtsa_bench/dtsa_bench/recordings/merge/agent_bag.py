@@ -21,6 +21,8 @@ from dtsa_agent.air.port import PortProperties
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.recordings.bag.errors import UnusableBag
+from dtsa_bench.recordings.bag.metadata import RECORD_KEY, RECORD_NAME, custom_data, load
+from dtsa_bench.recordings.bag.writer import BROKEN_OFF
 from dtsa_bench.runs.program import program
 
 from .agent_recorder import METADATA, REFUSED, SLOT, SUMMARY
@@ -106,7 +108,7 @@ def read(path: str | Path) -> AgentBag:
         raise UnusableBag(file, error.strerror or str(error)) from None
     if bag is None:
         raise UnusableBag(file, f"no bag of an agent on a network, as `{program()} agent --out` makes them")
-    bag.broken_off = not finished
+    bag.broken_off = bag.broken_off or not finished
     return bag
 
 
@@ -137,6 +139,8 @@ def _metadata(file: Path, record: Metadata, bag: AgentBag | None) -> AgentBag | 
             return AgentBag(file, int(values["id"]), swarm, _port(values), int(values["started_ns"]), goals_told=told)
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise UnusableBag(file, f"its settings cannot be read ({error})") from None
+    if record.name == RECORD_NAME and bag is not None:  # `recover` has made this file of one that was not finished
+        bag.broken_off = BROKEN_OFF in custom_data(load(values.get(RECORD_KEY, "")))
     if record.name == SUMMARY and bag is not None:
         bag.summary = json.loads(values.get("summary", "{}"))
     return bag
