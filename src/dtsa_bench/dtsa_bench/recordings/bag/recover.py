@@ -37,6 +37,7 @@ _KINDS: dict[int, Any] = {
     Opcode.HEADER: Header, Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK: Chunk,
     Opcode.METADATA: Metadata,
 }  # fmt: skip
+MOST_TRIED = 64  # times the size of a file: bytes of what looks like chunks that are tried
 _ATTACHMENT = object()
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of the entries that follow
 # A chunk up to its compressed records: length, below 2^40; times, size, checksum; compression; length of the records.
@@ -53,6 +54,7 @@ class Recovery:
     expected: dict[str, int] = field(default_factory=dict)  # by topic, where the old index still says it
     start_ns: int = 0
     end_ns: int = 0
+    whole_ns: int = 0  # log time up to which nothing is missing
     damaged: list[str] = field(default_factory=list)  # what is wrong, in words
     closed: bool = False  # whether the recorder finished the old file, and all of it could be read
 
@@ -68,8 +70,10 @@ class _DamagedFile:
     def __init__(self, path: Path, given: str | Path) -> None:
         self.path, self._given = path, given
         self.faults: list[str] = []  # where and why it cannot be read
+        self.whole_ns = 1 << 63  # log time of the last message before the first of them
         self.summary = Summary()  # as the file's own index has it; empty if there is none
         self.about: dict[str, Any] = {}  # what the recorder says of the bag
+        self._tried = 0  # bytes of what looked like chunks
 
     def __enter__(self) -> _DamagedFile:
         with ExitStack() as stack:
@@ -92,7 +96,8 @@ class _DamagedFile:
 
     def records(self) -> Iterator[Any]:
         """The records that can be read, in their order; a chunk's stand in its place."""
-        self.faults, position, size, last_ns = [], len(MAGIC), len(self._data), 0
+        self.faults, self.whole_ns = [], 1 << 63
+        position, size, last_ns = len(MAGIC), len(self._data), 0
         chunked = self._next_chunk(position) < size
         while position < size:
             try:
@@ -108,6 +113,7 @@ class _DamagedFile:
             except Exception as error:  # the library meets damage with many kinds of errors
                 goes_on = self._next_chunk(position + 1)
                 time = f", after {last_ns / 1e9:.3f} s," if last_ns else ""
+                self.whole_ns = min(self.whole_ns, last_ns)
                 self.faults.append(f"bytes {position} to {goes_on}{time} cannot be read ({error}) and are left out")
                 position = goes_on
                 continue
@@ -120,6 +126,9 @@ class _DamagedFile:
         while match := _CHUNK.search(self._data, position):
             position, end = match.start(), match.start() + PREFIX.size + int.from_bytes(match[1], "little")
             if match.end() + int.from_bytes(match[3], "little") == end <= len(self._data):
+                self._tried += end - position
+                if self._tried > MOST_TRIED * len(self._data):  # made so: chance has no such chunks within chunks
+                    break
                 with suppress(Exception):  # whatever the library meets: then it is none
                     _parsed(Opcode.CHUNK, self._data[position + PREFIX.size : end])
                     return position
@@ -175,10 +184,11 @@ def _copy(files: list[_DamagedFile], given: str | Path, result: Recovery) -> Non
         result.expected = dict(copy.expected)
         result.saved = writer.counts
         result.start_ns, result.end_ns = writer.time_range_ns
+        result.whole_ns = min(result.end_ns, *(file.whole_ns for file in files))
         expected = sum(result.expected.values())
         result.closed = 0 < expected <= result.count and all(file.summary.statistics for file in files)
         if not result.closed:
-            writer.custom_data[BROKEN_OFF] = str(result.end_ns)
+            writer.custom_data[BROKEN_OFF] = str(result.whole_ns)
     for file in files:
         result.damaged += file.faults
         if not file.summary.statistics:
@@ -242,9 +252,8 @@ class _Copy:
                     self._writer.custom_data[f"recovered_{KEY}"] = last[KEY]
             elif record is _ATTACHMENT:
                 self.lost["attachments are not copied"] += 1
-        for number, count in (
-            file.summary.statistics.channel_message_counts if file.summary.statistics else {}
-        ).items():
+        statistics = file.summary.statistics
+        for number, count in statistics.channel_message_counts.items() if statistics else ():
             self.expected[channels[number].topic if number in channels else "?"] += count
 
     def _write(self, channel: int, record: Message) -> None:

@@ -34,7 +34,7 @@ from .schema import Definition, installed
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
 FLUSH_S = 0.5
-BROKEN_OFF = "broken_off"  # key of custom_data of a bag saved from a file that was not finished: its end, ns
+BROKEN_OFF = "broken_off"  # key of custom_data of a bag of which a part is lost: log time up to which it is whole, ns
 KEY = "digest"  # name of the digest in custom_data
 _UNLIMITED = 1 << 62  # bytes: chunks end at marks
 _RECORD_BYTES = 31  # bytes of a message record beside its data
