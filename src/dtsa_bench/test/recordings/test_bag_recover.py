@@ -153,6 +153,15 @@ def test_what_follows_a_hole_in_the_middle_is_saved_too(run: SyntheticRun, tmp_p
         )
 
 
+def test_messages_whose_channels_are_lost_are_nothing_to_save(run: SyntheticRun, tmp_path: Path) -> None:
+    (start, end, _), *_, (_, last, _) = chunks_of(run.writer.path)
+    data = run.writer.path.read_bytes()
+    (tmp_path / "bad.mcap").write_bytes(data[:start] + bytes(end - start) + data[end:last])
+    with pytest.raises(UnusableBag, match="nothing to save"):
+        recover(tmp_path / "bad.mcap", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
 def test_the_new_bag_knows_its_run(run: SyntheticRun, tmp_path: Path) -> None:
     source = tmp_path / "flight"
     source.mkdir()

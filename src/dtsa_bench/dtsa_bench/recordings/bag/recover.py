@@ -205,13 +205,15 @@ def _begin(files: list[_DamagedFile], given: str | Path) -> tuple[str, dict[str,
     """
     profile, about = "", metadata.read_beside(files[0].path, given)
     for file in files:
-        about = {**about, **file.about}
+        about, channels = {**about, **file.about}, set(file.summary.channels)
         for record in file.records():
             if isinstance(record, Header):
                 profile = record.profile
             elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
                 about = {**about, **metadata.load(record.metadata.get(metadata.RECORD_KEY, ""))}
-            elif isinstance(record, Message):
+            elif isinstance(record, Channel):
+                channels.add(record.id)
+            elif isinstance(record, Message) and record.channel_id in channels:
                 return profile, about
     raise UnusableBag(given, "no message in it can be read: there is nothing to save")
 
