@@ -13,9 +13,8 @@ from typing import IO, Any
 
 import yaml
 import zstandard
+from mcap.records import Metadata
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
-
-from dtsa_agent.core.errors import ConfigError
 
 from .errors import UnusableBag
 
@@ -138,6 +137,11 @@ def load(text: str) -> dict[str, Any]:
     return loaded if isinstance(loaded, dict) else {}
 
 
+def load_record(record: Metadata) -> dict[str, Any]:
+    """What rosbag2's metadata record inside a file says."""
+    return load(record.metadata.get(RECORD_KEY, ""))
+
+
 def read(directory: Path) -> dict[str, Any]:
     """What `metadata.yaml` in a directory says, all values as texts; empty if there is none."""
     try:
@@ -188,39 +192,17 @@ _POLICIES = {
 }  # fmt: skip
 
 
-def profile(reliability: str = "reliable", durability: str = "volatile", depth: int = 10) -> Profile:
-    """One QoS profile with all the fields that rosbag2 stores."""
-    return {
-        "history": "keep_last",
-        "depth": depth,
-        "reliability": reliability,
-        "durability": durability,
-        "deadline": INFINITE,
-        "lifespan": INFINITE,
-        "liveliness": "automatic",
-        "liveliness_lease_duration": INFINITE,
-        "avoid_ros_namespace_conventions": False,
-    }
-
-
+_PROFILE: Profile = {
+    "history": "keep_last", "depth": 10, "reliability": "reliable", "durability": "volatile", "deadline": INFINITE,
+    "lifespan": INFINITE, "liveliness": "automatic", "liveliness_lease_duration": INFINITE,
+    "avoid_ros_namespace_conventions": False,
+}  # fmt: skip
 PROFILES: Mapping[str, Profile] = {
-    "reliable": profile(),
-    "best_effort": profile("best_effort"),
-    "sensor_data": profile("best_effort", depth=5),
-    "latched": profile("reliable", "transient_local", 1),
+    "reliable": _PROFILE,
+    "best_effort": _PROFILE | {"reliability": "best_effort"},
+    "sensor_data": _PROFILE | {"reliability": "best_effort", "depth": 5},
+    "latched": _PROFILE | {"durability": "transient_local", "depth": 1},
 }
-
-
-def resolve_profiles(qos: str | Sequence[Profile]) -> list[Profile]:
-    """Profiles from a name of `PROFILES`, or as they are given.
-
-    :raises ConfigError: if the name is unknown.
-    """
-    if not isinstance(qos, str):
-        return list(qos)
-    if qos not in PROFILES:
-        raise ConfigError("qos", qos, ", ".join(PROFILES))
-    return [PROFILES[qos]]
 
 
 def dump_profiles(profiles: Sequence[Profile]) -> str:

@@ -13,7 +13,6 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -35,6 +34,7 @@ from .schema import Definition
 
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
 _MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
+_ROS = "cdr/ros2msg"
 _ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
 
@@ -59,12 +59,7 @@ class Topic:
     profiles: tuple[metadata.Profile, ...]  # offered QoS
     type_hash: str  # "RIHS01_...", or empty
     definition: str  # message definition with all that it needs
-    encoding: str = "cdr/ros2msg"  # of messages and definition; only this one can be decoded
-
-    @property
-    def is_decodable(self) -> bool:
-        """Whether its messages are those of ROS 2."""
-        return self.encoding == "cdr/ros2msg"
+    encoding: str  # of messages and definition; "cdr/ros2msg" alone can be decoded
 
 
 class Bag:
@@ -105,10 +100,10 @@ class Bag:
             self._find_channels(summary, stream)
             self._add_topics(summary)
             self._readers.append(reader)
-        if self.topics and not any(topic.is_decodable for topic in self.topics.values()):
+        if self.topics and all(topic.encoding != _ROS for topic in self.topics.values()):
             topic = next(iter(self.topics.values()))
             raise UnusableBag(
-                self.given, f"topic {topic.name} is recorded as {topic.encoding}, not as cdr/ros2msg: not a ROS 2 bag"
+                self.given, f"topic {topic.name} is recorded as {topic.encoding}, not as {_ROS}: not a ROS 2 bag"
             )
         statistics = [s.statistics for r in self._readers if (s := r.get_summary()) and s.statistics]
         self.message_count = sum(part.message_count for part in statistics)
@@ -167,7 +162,7 @@ class Bag:
             with suppress(Exception):  # of a damaged record: whatever the library meets, there is none then
                 for record in reader.iter_metadata():
                     if record.name == metadata.RECORD_NAME:
-                        records.insert(0, metadata.load(record.metadata.get(metadata.RECORD_KEY, "")))
+                        records.insert(0, metadata.load_record(record))
         return [*records, metadata.read_beside(self.path, self.given)]
 
     @cached_property
@@ -228,8 +223,8 @@ class Bag:
         store = get_typestore(Stores.EMPTY)
         self._unusable: dict[str, str] = {}  # why a type cannot be decoded
         for topic in self.topics.values():
-            if not topic.is_decodable:
-                self._unusable[topic.type] = f"it is recorded as {topic.encoding}, not as cdr/ros2msg"
+            if topic.encoding != _ROS:
+                self._unusable[topic.type] = f"it is recorded as {topic.encoding}, not as {_ROS}"
             elif topic.type not in store.fielddefs:
                 try:
                     types = get_types_from_msg(topic.definition, topic.type)
@@ -305,9 +300,7 @@ class Bag:
     def __enter__(self) -> Bag:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *unused: object) -> None:
         self.close()
 
 

@@ -38,10 +38,9 @@ _KINDS: dict[int, Any] = {
     Opcode.METADATA: Metadata,
 }  # fmt: skip
 MOST_TRIED = 64  # times the size of a file: bytes of what looks like chunks that are tried
-_ATTACHMENT = object()
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of the entries that follow
 # A chunk up to its compressed records: length, below 2^40; times, size, checksum; compression; length of the records.
-_CHUNK = re.compile(rb"\x06(.{5}\0{3}).{28}(\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)(.{8})", re.DOTALL)
+_CHUNK = re.compile(rb"\x06(.{5}\0{3}).{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)(.{8})", re.DOTALL)
 
 
 @dataclass(slots=True)
@@ -64,35 +63,86 @@ class Recovery:
         return sum(self.saved.values())
 
 
-class _DamagedFile:
-    """One file of a bag, readable or not; a context manager."""
+def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
+    """Save all messages of a damaged bag that can be read to a new one.
 
-    def __init__(self, path: Path, given: str | Path) -> None:
-        self.path, self._given = path, given
+    :param path: the damaged bag: run directory, bag directory or .mcap file. It is only read.
+    :param directory: where the new bag is made; None: beside the old one, with `_recovered` appended to
+        its name.
+    :raises ConfigError: if the new directory is in use, or nothing at all can be read.
+    :raises BagError: if the new bag cannot be written.
+    """
+    paths, bag = metadata.find_files(path), metadata.bag_of(path).resolve()
+    beside = bag.with_name(f"{bag.name if bag.is_dir() else bag.name.partition('.mcap')[0]}_recovered")
+    result = Recovery(paths[0], beside if directory is None else Path(directory))
+    with ExitStack() as stack:
+        files = [_DamagedFile(part, path, stack) for part in paths]
+        profile, about = _begin(files, path)
+        custom_data = {**metadata.custom_data(about), metadata.RECOVERED_FROM: result.source.name}
+        with BagWriter(result.directory, None, custom_data=custom_data, min_time_ns=0, profile=profile) as writer:
+            copy = _Copy(writer, metadata.has_packed_messages(about))
+            for file in files:
+                copy.add(file)
+            result.saved, result.expected = writer.counts, dict(copy.expected)
+            result.start_ns, result.end_ns = writer.time_range_ns
+            result.whole_ns = min(result.end_ns, *(file.whole_ns for file in files))
+            expected = sum(result.expected.values())
+            result.closed = 0 < expected <= result.count and all(file.counts for file in files)
+            if not result.closed:
+                writer.custom_data[BROKEN_OFF] = str(result.whole_ns)
+    for file in files:
+        result.damaged += file.faults
+        if not file.counts:
+            result.damaged.append(f"the recorder did not close {file.path.name}")
+    result.damaged += [f"{count} {what}" for what, count in copy.lost.items()]
+    if expected > result.count:
+        result.damaged.append(f"{expected - result.count} of the {expected} messages that the bag had are lost")
+    return result
+
+
+def _begin(files: list[_DamagedFile], given: str | Path) -> tuple[str, dict[str, Any]]:
+    """MCAP's profile, and what the recorder says of the bag before its first message.
+
+    :raises UnusableBag: if there is no message that can be read.
+    """
+    profile, about = "", metadata.read_beside(files[0].path, given)
+    for file in files:
+        about, channels = {**about, **file.about}, set(file.summary.channels)
+        for record in file.records():
+            if isinstance(record, Header):
+                profile = record.profile
+            elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
+                about = {**about, **metadata.load_record(record)}
+            elif isinstance(record, Channel):
+                channels.add(record.id)
+            elif isinstance(record, Message) and record.channel_id in channels:
+                return profile, about
+    raise UnusableBag(given, "no message in it can be read: there is nothing to save")
+
+
+class _DamagedFile:
+    """One file of a bag, readable or not; open as long as the stack."""
+
+    def __init__(self, path: Path, given: str | Path, stack: ExitStack) -> None:
+        self.path = path
         self.faults: list[str] = []  # where and why it cannot be read
         self.whole_ns = 1 << 63  # log time of the last message before the first of them
         self.summary = Summary()  # as the file's own index has it; empty if there is none
-        self.about: dict[str, Any] = {}  # what the recorder says of the bag
+        self.counts: dict[int, int] = {}  # messages by channel, likewise
+        self.about: dict[str, Any] = {}  # what the recorder says of the bag, likewise
         self._tried = 0  # bytes of what looked like chunks
-
-    def __enter__(self) -> _DamagedFile:
-        with ExitStack() as stack:
-            stream = stack.enter_context(metadata.open_file(self.path))
-            if stream.read(len(MAGIC)) != MAGIC:
-                raise UnusableBag(self._given, f"{self.path.name} is not an MCAP file, or its beginning is lost")
-            self._data = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
-            with suppress(Exception):  # of a damaged file: whatever the library meets, there is no index then
-                stream.seek(0)
-                reader = SeekingReader(stream)
-                self.summary = reader.get_summary() or self.summary
-                for record in reader.iter_metadata():
-                    if record.name == metadata.RECORD_NAME:
-                        self.about = metadata.load(record.metadata.get(metadata.RECORD_KEY, ""))
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *unused: object) -> None:
-        self._stack.close()
+        stream = stack.enter_context(metadata.open_file(path))
+        if stream.read(len(MAGIC)) != MAGIC:
+            raise UnusableBag(given, f"{path.name} is not an MCAP file, or its beginning is lost")
+        self._data = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+        with suppress(Exception):  # of a damaged file: whatever the library meets, there is no index then
+            stream.seek(0)
+            reader = SeekingReader(stream)
+            self.summary = reader.get_summary() or self.summary
+            self.counts = self.summary.statistics.channel_message_counts if self.summary.statistics else {}
+            for record in reader.iter_metadata():
+                if record.name == metadata.RECORD_NAME:
+                    self.about = metadata.load_record(record)
 
     def records(self) -> Iterator[Any]:
         """The records that can be read, in their order; a chunk's stand in its place."""
@@ -113,9 +163,8 @@ class _DamagedFile:
             except Exception as error:  # the library meets damage with many kinds of errors
                 goes_on = self._next_chunk(position + 1)
                 time = f", after {last_ns / 1e9:.3f} s," if last_ns else ""
-                self.whole_ns = min(self.whole_ns, last_ns)
                 self.faults.append(f"bytes {position} to {goes_on}{time} cannot be read ({error}) and are left out")
-                position = goes_on
+                self.whole_ns, position = min(self.whole_ns, last_ns), goes_on
                 continue
             yield from records
             last_ns = max((record.log_time for record in records if isinstance(record, Message)), default=last_ns)
@@ -125,7 +174,7 @@ class _DamagedFile:
         """Where the next whole chunk begins; the end of the file if there is none."""
         while match := _CHUNK.search(self._data, position):
             position, end = match.start(), match.start() + PREFIX.size + int.from_bytes(match[1], "little")
-            if match.end() + int.from_bytes(match[3], "little") == end <= len(self._data):
+            if match.end() + int.from_bytes(match[2], "little") == end <= len(self._data):
                 self._tried += end - position
                 if self._tried > MOST_TRIED * len(self._data):  # made so: chance has no such chunks within chunks
                     break
@@ -138,9 +187,9 @@ class _DamagedFile:
 
 def _parsed(opcode: int, content: bytes) -> list[Any]:
     """One record as the library's objects, a chunk as those in it; raises errors of any kind for a damaged one."""
-    if opcode == Opcode.ATTACHMENT:
-        return [_ATTACHMENT]
-    if opcode == Opcode.MESSAGE_INDEX and _INDEX.unpack_from(content)[1] == len(content) - _INDEX.size:
+    if opcode == Opcode.ATTACHMENT or (
+        opcode == Opcode.MESSAGE_INDEX and _INDEX.unpack_from(content)[1] == len(content) - _INDEX.size
+    ):
         return []
     stream = ReadDataStream(BytesIO(content))
     if opcode == Opcode.MESSAGE:
@@ -153,82 +202,13 @@ def _parsed(opcode: int, content: bytes) -> list[Any]:
     return breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
 
 
-def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
-    """Save all messages of a damaged bag that can be read to a new one.
-
-    :param path: the damaged bag: run directory, bag directory or .mcap file. It is only read.
-    :param directory: where the new bag is made; None: beside the old one, with `_recovered` appended to
-        its name.
-    :raises ConfigError: if the new directory is in use, or nothing at all can be read.
-    :raises BagError: if the new bag cannot be written.
-    """
-    paths, bag = metadata.find_files(path), metadata.bag_of(path).resolve()
-    beside = bag.with_name(f"{bag.name if bag.is_dir() else bag.name.partition('.mcap')[0]}_recovered")
-    result = Recovery(paths[0], beside if directory is None else Path(directory))
-    with ExitStack() as stack:
-        _copy([stack.enter_context(_DamagedFile(part, path)) for part in paths], path, result)
-    return result
-
-
-def _copy(files: list[_DamagedFile], given: str | Path, result: Recovery) -> None:
-    """Write the new bag, and what was found into the result."""
-    profile, about = _begin(files, given)
-    custom_data = {**metadata.custom_data(about), metadata.RECOVERED_FROM: result.source.name}
-    distro = str(about.get("ros_distro") or "jazzy")
-    with BagWriter(
-        result.directory, None, custom_data=custom_data, ros_distro=distro, min_time_ns=0, profile=profile
-    ) as writer:
-        copy = _Copy(writer, metadata.has_packed_messages(about))
-        for file in files:
-            copy.add(file)
-        result.expected = dict(copy.expected)
-        result.saved = writer.counts
-        result.start_ns, result.end_ns = writer.time_range_ns
-        result.whole_ns = min(result.end_ns, *(file.whole_ns for file in files))
-        expected = sum(result.expected.values())
-        result.closed = 0 < expected <= result.count and all(file.summary.statistics for file in files)
-        if not result.closed:
-            writer.custom_data[BROKEN_OFF] = str(result.whole_ns)
-    for file in files:
-        result.damaged += file.faults
-        if not file.summary.statistics:
-            result.damaged.append(f"the recorder did not close {file.path.name}")
-    result.damaged += [f"{count} {what}" for what, count in copy.lost.items()]
-    if expected > result.count:
-        result.damaged.append(f"{expected - result.count} of the {expected} messages that the bag had are lost")
-
-
-def _begin(files: list[_DamagedFile], given: str | Path) -> tuple[str, dict[str, Any]]:
-    """MCAP's profile, and what the recorder says of the bag before its first message.
-
-    :raises UnusableBag: if there is no message that can be read.
-    """
-    profile, about = "", metadata.read_beside(files[0].path, given)
-    for file in files:
-        about, channels = {**about, **file.about}, set(file.summary.channels)
-        for record in file.records():
-            if isinstance(record, Header):
-                profile = record.profile
-            elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
-                about = {**about, **metadata.load(record.metadata.get(metadata.RECORD_KEY, ""))}
-            elif isinstance(record, Channel):
-                channels.add(record.id)
-            elif isinstance(record, Message) and record.channel_id in channels:
-                return profile, about
-    raise UnusableBag(given, "no message in it can be read: there is nothing to save")
-
-
 class _Copy:
-    """What is copied to a new bag.
-
-    :param packed: whether messages are compressed one by one: they are unpacked.
-    """
+    """What is copied to a new bag; `packed`: messages are compressed one by one, and are unpacked."""
 
     def __init__(self, writer: BagWriter, packed: bool) -> None:
-        self._writer = writer
-        self._unpack = metadata.unpack_message if packed else bytes
+        self._writer, self._unpack = writer, metadata.unpack_message if packed else bytes
         self._topics: dict[str, tuple[int, Definition]] = {}  # channel of the new bag, what it is
-        self.lost: Counter[str] = Counter()  # by what is lost
+        self.lost: Counter[str] = Counter()  # by why it is lost
         self.expected: Counter[str] = Counter()  # messages by topic, as the files' own indexes say
 
     def add(self, file: _DamagedFile) -> None:
@@ -245,29 +225,25 @@ class _Copy:
             elif isinstance(record, Channel):
                 channels[record.id] = record
                 targets[record.id] = self._channel(record, schemas)
+            elif isinstance(record, Metadata) and record.name != metadata.RECORD_NAME:
+                self._writer.add_metadata(record.name, record.metadata)
             elif isinstance(record, Metadata):
-                if record.name != metadata.RECORD_NAME:
-                    self._writer.add_metadata(record.name, record.metadata)
-                    continue
-                last = metadata.custom_data(metadata.load(record.metadata.get(metadata.RECORD_KEY, "")))
+                last = metadata.custom_data(metadata.load_record(record))
                 if KEY in last:  # the new bag gets a digest of its own
                     self._writer.custom_data[f"recovered_{KEY}"] = last[KEY]
-            elif record is _ATTACHMENT:
-                self.lost["attachments are not copied"] += 1
-        statistics = file.summary.statistics
-        for number, count in statistics.channel_message_counts.items() if statistics else ():
+        for number, count in file.counts.items():
             self.expected[channels[number].topic if number in channels else "?"] += count
 
     def _write(self, channel: int, record: Message) -> None:
-        if not channel:
-            self.lost["messages belong to topics that are not defined"] += 1
-            return
         try:
             data = self._unpack(record.data)
         except (ZstdError, MemoryError):
             self.lost["messages cannot be unpacked"] += 1
             return
-        self._writer.write(channel, data, record.log_time, record.publish_time, record.sequence)
+        if channel:
+            self._writer.write(channel, data, record.log_time, record.publish_time, record.sequence)
+        else:
+            self.lost["messages belong to topics that are not defined"] += 1
 
     def _channel(self, channel: Channel | None, schemas: Mapping[int, Schema]) -> int:
         """The new bag's channel for one of the file; 0: it is not defined, or its topic has another type already."""

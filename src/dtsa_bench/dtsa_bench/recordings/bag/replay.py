@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.wire.cdr import SECOND
@@ -24,21 +24,10 @@ POLL_NS = 20_000_000  # ns of wall time between two calls of `poll`
 MAX_DEPTH = 1000  # messages that a publisher keeps for late subscribers at most
 
 
-class Output(Protocol):
-    """Where a player's messages go."""
-
-    def publish(self, message: Message) -> None:
-        """Publish one recorded message now."""
-
-    def clock(self, time_ns: int) -> None:
-        """Publish the simulated time now."""
-
-
 class Player:
     """Plays one bag to one output.
 
-    :param bag: open bag; used by this player alone while it plays.
-    :param output: takes the messages.
+    :param output: takes the messages and the time: a `RosOutput`, or what has its `publish` and `clock`.
     :param rate: simulated seconds in one second of wall time, above 0.
     :param start_s: s from the bag's start, where to begin.
     :param loop: begin again at the end.
@@ -50,7 +39,7 @@ class Player:
     def __init__(
         self,
         bag: Bag,
-        output: Output,
+        output: Any,
         rate: float = 1.0,
         start_s: float = 0.0,
         loop: bool = False,
@@ -154,10 +143,8 @@ class RosOutput:
                 raise ConfigError("topic", topic.name, allowed) from None
         if not self._publishers:
             raise BagError("none of the topics can be played")
-        self._clock: Any = None
-        if CLOCK not in self._publishers:
-            self._clock = node.create_publisher(Clock, CLOCK, ros_profile([PROFILES["best_effort"]]))
-        self._time = Clock()
+        self._time, best_effort = Clock(), ros_profile([PROFILES["best_effort"]])
+        self._clock = None if CLOCK in self._publishers else node.create_publisher(Clock, CLOCK, best_effort)
 
     @property
     def topics(self) -> list[str]:
@@ -183,10 +170,8 @@ def ros_profile(profiles: Collection[Profile], count: int = 0) -> Any:
     """rclpy's QoSProfile of one publisher in place of those that were recorded.
 
     It is reliable if all of them were, and keeps messages for late subscribers if one of them did: as many as they did
-    together, or all where the recording does not say how many that were: the middleware does not tell a recorder.
-
-    :param profiles: recorded profiles; none: the default profile.
-    :param count: messages on the topic.
+    together, or all `count` of the topic where the recording does not know how many that were, as the middleware does
+    not tell a recorder.
     """
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 

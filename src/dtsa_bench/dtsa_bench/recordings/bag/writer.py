@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 from time import monotonic
-from types import TracebackType
 from typing import Any, NoReturn
 
 from mcap.writer import CompressionType, Writer
@@ -53,19 +52,6 @@ class _Channel:
     has_run: bool  # its messages carry the run's id
     count: int = 0  # messages written
 
-    def metadata(self) -> dict[str, Any]:
-        """Its entry in `metadata.yaml`."""
-        return {
-            "topic_metadata": {
-                "name": self.topic,
-                "type": self.definition.name,
-                "serialization_format": self.definition.message_encoding,
-                "offered_qos_profiles": self.profiles,
-                "type_description_hash": self.definition.type_hash,
-            },
-            "message_count": self.count,
-        }
-
 
 class BagWriter:
     """One bag directory being recorded. For one thread; a context manager.
@@ -76,7 +62,6 @@ class BagWriter:
     :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
     :param chunk_size: bytes, size at which a chunk is closed even if its half second is not over.
     :param custom_data: further texts for `custom_data` of the metadata.
-    :param ros_distro: ROS distribution named in the metadata.
     :param min_time_ns: ns, earliest log time that is accepted.
     :param marked: whether chunks end at a `mark` only; the recorder calls it after each step of the run.
     :param profile: MCAP's name for the conventions that topics and messages follow.
@@ -91,7 +76,6 @@ class BagWriter:
         compression: str = "zstd",
         chunk_size: int = 1 << 20,
         custom_data: Mapping[str, str] | None = None,
-        ros_distro: str = "jazzy",
         min_time_ns: int = MIN_TIME_NS,
         marked: bool = False,
         profile: str = "ros2",
@@ -111,12 +95,7 @@ class BagWriter:
             }
         if marked:
             self.custom_data["chunks"] = "complete steps"
-        self._marked, self._chunk_size, self._min_time_ns, self._ros_distro = (
-            marked,
-            chunk_size,
-            min_time_ns,
-            ros_distro,
-        )
+        self._marked, self._chunk_size, self._min_time_ns = marked, chunk_size, min_time_ns
         self._chunk_bytes = 0  # in the chunk that is being filled
         self.path = self.directory / f"{self.directory.resolve().name}_0.mcap"
         self._channels: list[_Channel] = []  # the channel's number - 1 is its index
@@ -133,12 +112,10 @@ class BagWriter:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         size = _UNLIMITED if marked else chunk_size
         self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
-        try:
+        with self._failing():
             self._mcap.start(profile=profile, library=f"dtsa {__version__}")
             self._add_own_metadata()
             self._stream.flush()
-        except OSError as error:
-            self._fail(error)
         self._next_flush = monotonic() + FLUSH_S
 
     @property
@@ -176,7 +153,9 @@ class BagWriter:
         self._check_open()
         if any(channel.topic == topic for channel in self._channels):
             raise ConfigError("topic", topic, "a name that is not in the bag yet")
-        profiles = metadata.resolve_profiles(qos)
+        if isinstance(qos, str) and qos not in metadata.PROFILES:
+            raise ConfigError("qos", qos, ", ".join(metadata.PROFILES))
+        profiles = [metadata.PROFILES[qos]] if isinstance(qos, str) else list(qos)
         definition = definition or installed(type_name)
         schema = self._schemas.get(definition, 0)  # 0: a channel without one
         if not schema and definition.encoding:
@@ -226,15 +205,10 @@ class BagWriter:
             self.flush()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Store a metadata record of another name than rosbag2's.
-
-        :raises BagError: if that fails, on a full disk for example.
-        """
-        self.flush()  # records of metadata stand between chunks
-        try:
+        """Store a metadata record of another name than rosbag2's; raises BagError if that fails."""
+        self.flush()  # such a record stands between chunks
+        with self._failing():
             self._mcap.add_metadata(name, dict(values))
-        except OSError as error:
-            self._fail(error)
 
     def mark(self) -> None:
         """What has been written until now is a run up to a complete step: a chunk may end here.
@@ -253,10 +227,8 @@ class BagWriter:
         :raises BagError: if that fails, on a full disk for example.
         """
         self._check_open()
-        try:
+        with self._failing():
             self._mcap.flush()
-        except OSError as error:
-            self._fail(error)
         self._unsaved = self._chunk_bytes = 0
         self._next_flush = monotonic() + FLUSH_S
 
@@ -273,21 +245,17 @@ class BagWriter:
                 self._stream.close()
             return
         self.custom_data[KEY] = self._digest.hexdigest()
-        try:
+        with self._failing():
             self._mcap.flush()
             self._add_own_metadata()
             self._mcap.finish()
             self._stream.close()
             metadata.write(self.directory, self._metadata())
-        except OSError as error:
-            self._fail(error)
 
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *unused: object) -> None:
         self.close()
 
     def _metadata(self) -> dict[str, Any]:
@@ -298,17 +266,30 @@ class BagWriter:
             "duration": {"nanoseconds": end_ns - start_ns},
             "message_count": self.message_count,
         }
+        topics = [
+            {
+                "topic_metadata": {
+                    "name": channel.topic,
+                    "type": channel.definition.name,
+                    "serialization_format": channel.definition.message_encoding,
+                    "offered_qos_profiles": channel.profiles,
+                    "type_description_hash": channel.definition.type_hash,
+                },
+                "message_count": channel.count,
+            }
+            for channel in self._channels
+        ]
         return {
             "version": metadata.VERSION,
             "storage_identifier": "mcap",
             **extent,
-            "topics_with_message_count": [channel.metadata() for channel in self._channels],
+            "topics_with_message_count": topics,
             "compression_format": "",
             "compression_mode": "",
             "relative_file_paths": [self.path.name],
             "files": [{"path": self.path.name, **extent}],
             "custom_data": self.custom_data,
-            "ros_distro": self._ros_distro,
+            "ros_distro": "jazzy",
         }
 
     def _add_own_metadata(self) -> None:
@@ -319,6 +300,13 @@ class BagWriter:
             raise BagError(self._failure)
         if self._closed:
             raise BagError(f"the bag {self.directory} is closed: nothing more can be recorded to it")
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._fail(error)
 
     def _fail(self, error: OSError) -> NoReturn:
         lost = f", up to {self._unsaved} messages are not saved" if self._unsaved else ""
@@ -348,16 +336,12 @@ class BagDigest:
     def add(
         self, topic: bytes, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes, run: bool = False
     ) -> None:
-        """Take in one message.
-
-        :param data: its CDR bytes.
-        :param run: whether it carries a run's id.
-        """
+        """Take in one message; `run`: whether its bytes carry a run's id."""
         state = blake2b(topic, digest_size=16)
         state.update(_TIMES.pack(log_time_ns, publish_time_ns, sequence))
         state.update(without_run(data) if run else data)
         self._sum = (self._sum + int.from_bytes(state.digest(), "little")) & _MASK
 
     def hexdigest(self) -> str:
-        """The digest so far, 32 hexadecimal digits."""
+        """The digest so far."""
         return f"{self._sum:032x}"
