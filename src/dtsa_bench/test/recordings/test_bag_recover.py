@@ -19,8 +19,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.commands import cli
 from dtsa_bench.recordings.bag import writer
 from dtsa_bench.recordings.bag.errors import UnusableBag
-from dtsa_bench.recordings.bag.reader import MAGIC, Bag
-from dtsa_bench.recordings.bag.recover import PREFIX, recover
+from dtsa_bench.recordings.bag.reader import MAGIC, PREFIX, Bag
+from dtsa_bench.recordings.bag.recover import recover
 from dtsa_bench.recordings.verify import verify_bag
 from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig

@@ -28,11 +28,10 @@ from zstandard import ZstdError
 
 from . import metadata
 from .errors import UnusableBag
-from .reader import MAGIC, definition_of
+from .reader import MAGIC, PREFIX, definition_of
 from .schema import Definition
 from .writer import BROKEN_OFF, KEY, BagWriter
 
-PREFIX = struct.Struct("<BQ")  # opcode and length of every record
 _KINDS: dict[int, Any] = {
     Opcode.HEADER: Header, Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK: Chunk,
     Opcode.METADATA: Metadata,
