@@ -10,7 +10,7 @@ import heapq
 import json
 import struct
 from bisect import bisect_left
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -103,8 +103,9 @@ class Bag:
                 raise self._damaged("it has no index")
             if summary.statistics.message_count and not summary.chunk_indexes:
                 raise self._damaged("its messages are not in indexed chunks")
-            self._find_channels(summary, stream)
-            self._add_topics(summary)
+            counts = {number: count for number, count in summary.statistics.channel_message_counts.items() if count}
+            self._find_channels(summary, counts, stream)
+            self._add_topics(summary, counts)
             self._parts.append((stream, reader, summary))
         if self.topics and all(topic.encoding != _ROS for topic in self.topics.values()):
             topic = next(iter(self.topics.values()))
@@ -123,12 +124,11 @@ class Bag:
     def _damaged(self, what: str) -> UnusableBag:
         return UnusableBag(self.given, f"{what}; `{program()} recover {self.given}` saves what can be read")
 
-    def _find_channels(self, summary: Summary, stream: IO[bytes]) -> None:
+    def _find_channels(self, summary: Summary, counts: Mapping[int, int], stream: IO[bytes]) -> None:
         """Complete a summary that repeats no channels or schemas by those that stand before the messages."""
-        counts = summary.statistics.channel_message_counts if summary.statistics else {}
         for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
-            channels = [summary.channels.get(number) for number, count in counts.items() if count]
-            if all(channel and (channel.schema_id or 0) in (0, *summary.schemas) for channel in channels):
+            channels = [summary.channels.get(number) for number in counts]
+            if all(channel and channel.schema_id in (0, *summary.schemas) for channel in channels):
                 return
             with self._reading(index):
                 for opcode, record in _records_of(stream, index):
@@ -139,11 +139,10 @@ class Bag:
                     elif opcode == Opcode.CHANNEL:
                         channel = Channel.read(content)
                         summary.channels.setdefault(channel.id, channel)
-        if any(number not in summary.channels for number, count in counts.items() if count):
+        if not counts.keys() <= summary.channels.keys():
             raise self._damaged("the channels of some messages are not defined")
 
-    def _add_topics(self, summary: Summary) -> None:
-        counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    def _add_topics(self, summary: Summary, counts: Mapping[int, int]) -> None:
         for number, channel in sorted(summary.channels.items()):
             definition = definition_of(channel, summary.schemas.get(channel.schema_id))
             if definition.name.startswith(_ON_A_NETWORK):

@@ -20,8 +20,7 @@ from .errors import BagError
 _BROUGHT = Path(__file__).resolve().parent / "messages"  # those of dtsa_msgs, where there is no ROS
 SEPARATOR = "=" * 80
 _PRIMITIVE = re.compile(r"bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string")
-_FIELD = re.compile(r"\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]\w*\s*(?!\s*=)")
-_CONSTANT = re.compile(r"\s*[A-Za-z][\w/]*(?:<=\d+)?\s+[A-Z]\w*\s*=")
+_FIELD = re.compile(r"\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]")  # or a constant, of a primitive type
 _MESSAGE_TYPE = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*")
 
 
@@ -38,13 +37,9 @@ class Definition:
 
 def _dependencies(text: str, package: str) -> list[str]:
     """Types of messages that a definition names, in order of appearance."""
-    names = []
-    for line in text.splitlines():
-        match = _FIELD.match(line.split("#", 1)[0])
-        if match and not _PRIMITIVE.fullmatch(match[1]) and not _CONSTANT.match(line.split("#", 1)[0]):
-            owner, _, short = match[1].rpartition("/")
-            names.append(f"{owner.split('/')[0] or package}/msg/{short}")
-    return names
+    names = (match[1] for line in text.splitlines() if (match := _FIELD.match(line)))
+    types = (name.rpartition("/") for name in names if not _PRIMITIVE.fullmatch(name))
+    return [f"{owner.partition('/')[0] or package}/msg/{short}" for owner, _, short in types]
 
 
 def concatenate(name: str, text_of: Callable[[str], str]) -> str:
@@ -73,11 +68,8 @@ def installed(name: str) -> Definition:
         raise BagError(f"message type {name!r}: not of the form package/msg/Type")
     if importlib.util.find_spec("ament_index_python") is None and _BROUGHT.is_dir():
         return brought(name, _BROUGHT)
-    description = _file(name, ".json")
-    hashes = json.loads(description.read_text(encoding="utf-8"))["type_hashes"]
-    type_hash = next((entry["hash_string"] for entry in hashes if entry["type_name"] == name), None)
-    if type_hash is None:
-        raise BagError(f"message type {name}: {description} holds no hash of it")
+    hashes = json.loads(_file(name, ".json").read_text(encoding="utf-8"))["type_hashes"]
+    type_hash = next(entry["hash_string"] for entry in hashes if entry["type_name"] == name)
     return Definition(name, concatenate(name, lambda kind: _file(kind, ".msg").read_text(encoding="utf-8")), type_hash)
 
 
