@@ -184,6 +184,12 @@ def test_bags_unfinished_damaged_or_of_others_are_refused_by_what_they_lack(run:
     (tmp_path / "bad.mcap").write_bytes(data)
     with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match=r"damaged chunk.*recover"):
         list(bag.messages())
+    data = bytearray(whole)
+    data[whole.rindex(b"/swarm/decision") + 3] ^= 1  # in the index
+    (tmp_path / "index.mcap").write_bytes(data)
+    with pytest.raises(UnusableBag, match=r"index does not fit its checksum.*recover"):
+        Bag(tmp_path / "index.mcap")
+    assert recover(tmp_path / "index.mcap", tmp_path / "whole").saved == run.writer.counts
     path = tmp_path / "json.mcap"
     writer = Writer(str(path))
     writer.start(profile="")

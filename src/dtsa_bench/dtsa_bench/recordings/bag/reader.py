@@ -9,6 +9,7 @@ from __future__ import annotations
 import heapq
 import json
 import struct
+import zlib
 from bisect import bisect_left
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -40,6 +41,7 @@ MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
 _MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
 _MESSAGE = struct.Struct("<HIQQ")  # a message up to its data: channel, number on it, log time, publish time
+_END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
 _ROS = "cdr/ros2msg"
 _ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
@@ -93,10 +95,8 @@ class Bag:
                 stream.seek(-len(MAGIC), 2)
                 if stream.read() != MAGIC:
                     raise McapError("no end mark")
-                stream.seek(0)
-                reader = SeekingReader(stream, validate_crcs=True)
+                reader, summary = read_index(stream)
                 reader.get_header()
-                summary = reader.get_summary()
             except Exception as error:  # the library meets damaged files with many kinds of errors
                 raise self._damaged(f"it was not closed, or is damaged ({error or type(error).__name__})") from None
             if summary is None or summary.statistics is None:
@@ -333,6 +333,18 @@ class Bag:
 
     def __exit__(self, *unused: object) -> None:
         self.close()
+
+
+def read_index(stream: IO[bytes]) -> tuple[SeekingReader, Summary | None]:
+    """A reader and the index at the end of a file, None if it has none; raises errors of any kind for a damaged one."""
+    stream.seek(-_END.size, 2)
+    start, _, checksum, _ = _END.unpack(stream.read())
+    stream.seek(start)
+    if start and checksum and zlib.crc32(stream.read()[:-12]) != checksum:  # it covers all that stands before it
+        raise McapError("its index does not fit its checksum")
+    stream.seek(0)
+    reader = SeekingReader(stream)
+    return reader, reader.get_summary()
 
 
 def definition_of(channel: Channel, schema: Schema | None) -> Definition:

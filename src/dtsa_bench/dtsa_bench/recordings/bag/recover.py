@@ -20,7 +20,6 @@ from typing import Any
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
@@ -28,7 +27,7 @@ from zstandard import ZstdError
 
 from . import metadata
 from .errors import UnusableBag
-from .reader import MAGIC, PREFIX, definition_of
+from .reader import MAGIC, PREFIX, definition_of, read_index
 from .schema import Definition
 from .writer import BROKEN_OFF, KEY, BagWriter
 
@@ -92,7 +91,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
     for file in files:
         result.damaged += file.faults
         if not file.counts:
-            result.damaged.append(f"the recorder did not close {file.path.name}")
+            result.damaged.append(f"{file.path.name} was not closed, or its index is damaged")
     result.damaged += [f"{count} {what}" for what, count in copy.lost.items()]
     if expected > result.count:
         result.damaged.append(f"{expected - result.count} of the {expected} messages that the bag had are lost")
@@ -135,9 +134,8 @@ class _DamagedFile:
             raise UnusableBag(given, f"{path.name} is not an MCAP file, or its beginning is lost")
         self._data = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
         with suppress(Exception):  # of a damaged file: whatever the library meets, there is no index then
-            stream.seek(0)
-            reader = SeekingReader(stream)
-            self.summary = reader.get_summary() or self.summary
+            reader, summary = read_index(stream)
+            self.summary = summary or self.summary
             self.counts = self.summary.statistics.channel_message_counts if self.summary.statistics else {}
             for record in reader.iter_metadata():
                 if record.name == metadata.RECORD_NAME:
