@@ -38,11 +38,11 @@ from .errors import BagError, UnusableBag
 from .schema import Definition
 
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
-_MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
 _MESSAGE = struct.Struct("<HIQQ")  # a message up to its data: channel, number on it, log time, publish time
 _END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
 _ROS = "cdr/ros2msg"
+_MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
 _ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
 
