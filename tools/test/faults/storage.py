@@ -11,6 +11,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 from fly_helpers import ENDLESS, FlightProcess, run_dtsa, start_flight
+from mcap.reader import make_reader
 
 from .row import LOCKSTEP, REALTIME, fault, in_flight
 
@@ -101,7 +102,9 @@ def bag_cut(directory: Path) -> None:
 def bag_changed(directory: Path) -> None:
     path = _fly(directory)
     data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 1
+    with path.open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes  # what stands between them is an index nobody reads
+    data[chunks[len(chunks) // 2].chunk_start_offset + 100] ^= 1
     path.write_bytes(data)
     done = run_dtsa("verify", str(path))
     assert done.returncode != 0

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export the bag."""
-    from dtsa_bench.log.bag.place import bag_of
+    from dtsa_bench.log.bag.metadata import bag_of
     from dtsa_bench.log.merged_bag import open_log
     from dtsa_bench.log.tables import export
 

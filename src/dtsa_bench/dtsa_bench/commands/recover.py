@@ -9,8 +9,8 @@ import json
 from .registry import RECORDED_RUN
 
 DESCRIPTION = """\
-Makes a full bag of what a killed recorder, a full disk or a damaged file left: all up to the first damaged place. It
-says what was saved, and what is lost. The original is only read."""
+Makes a full bag of what a killed recorder, a full disk or a damaged file left: all that can be read. It says what was
+saved, and what is lost. The original is only read."""
 EXAMPLES = (("runs/a", "into runs/a/bag_recovered"),)
 
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     seconds = (result.end_ns - result.start_ns) / 1e9
     print(f"saved {result.count} messages, {seconds:.3f} s of simulated time, to {result.directory}")
     if not result.closed:
-        print(f"  the recording breaks off at {result.end_ns / 1e9:.3f} s; `verify` checks it up to there")
+        print(f"  the recording breaks off at {result.whole_ns / 1e9:.3f} s; `verify` checks it up to there")
     for note in result.damaged or ["the file was whole: nothing was lost"]:
         print(f"  {note}")
     return 0

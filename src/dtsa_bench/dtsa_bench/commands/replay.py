@@ -60,8 +60,9 @@ def run(args: argparse.Namespace) -> int:
         limit_to_machine(os.environ)
         init_ros(None)
         try:
-            output = RosOutput(rclpy.create_node("replay", enable_rosout=False, start_parameter_services=False), topics)
-            player = Player(bag, output, args.rate, args.start, args.loop, args.topics)
+            node = rclpy.create_node("replay", enable_rosout=False, start_parameter_services=False)
+            output = RosOutput(node, topics, lambda line: print(f"dtsa: warning: {line}", file=sys.stderr, flush=True))
+            player = Player(bag, output, args.rate, args.start, args.loop, output.topics)
 
             def stop(*_: object) -> None:
                 player.stopped = True
@@ -69,7 +70,10 @@ def run(args: argparse.Namespace) -> int:
             signal.signal(signal.SIGINT, stop)
             signal.signal(signal.SIGTERM, stop)
             seconds = (bag.end_ns - bag.start_ns) / 1e9
-            print(f"playing {len(topics)} topics, {seconds:.2f} s of simulated time, at rate {args.rate:g}", flush=True)
+            print(
+                f"playing {len(output.topics)} topics, {seconds:.2f} s of simulated time, at rate {args.rate:g}",
+                flush=True,
+            )
             while args.wait_for_subscriber and not player.stopped and not output.subscribers():
                 time.sleep(0.02)
             begin = time.monotonic() + args.delay

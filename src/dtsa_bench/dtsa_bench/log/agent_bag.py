@@ -50,6 +50,7 @@ from dtsa_bench.log.record import (
 )
 from dtsa_bench.log.bag import metadata, schema
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.writer import BROKEN_OFF
 from dtsa_bench.runs.config import REALTIME
 from dtsa_bench.runs.options import new_directory
 from dtsa_bench.runs.program import program
@@ -293,7 +294,7 @@ def read(path: str | Path) -> AgentBag:
         raise UnusableBag(file, error.strerror or str(error)) from None
     if bag is None:
         raise UnusableBag(file, f"no bag of an agent on a network, as `{program()} agent --out` makes them")
-    bag.broken_off = not is_finished
+    bag.broken_off = bag.broken_off or not is_finished
     return bag
 
 
@@ -339,6 +340,7 @@ def _read_about(file: Path, record: Metadata, bag: AgentBag | None) -> AgentBag 
                 file, int(about["id"]), swarm, port, int(about["started_ns"]),
                 goals_told=bool(about["goals_told"]), zero_ns=int(about["zero_ns"]),
             )  # fmt: skip
+        bag.broken_off = BROKEN_OFF in custom  # `recover` has made this file of one that was not finished
         bag.summary = json.loads(custom.get(SUMMARY, "{}"))
         bag.refused = Counter({str(why): int(count) for why, count in bag.summary.get("not_taken_in", {}).items()})
     except (KeyError, ValueError, TypeError, AttributeError) as error:

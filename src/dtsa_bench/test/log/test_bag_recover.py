@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import random
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -88,22 +90,32 @@ def test_100_truncations_give_back_all_whole_chunks(run: SyntheticRun, tmp_path:
         assert said
 
 
+def whole_rows(run: SyntheticRun, damaged: Callable[[int, int], bool]) -> list[Row]:
+    """The messages of all chunks but the damaged ones, by where a chunk begins and ends in the file."""
+    rows, saved = rows_of(run.writer.path), []
+    for start, end, count in chunks_of(run.writer.path):
+        saved += [] if damaged(start, end) else rows[:count]
+        rows = rows[count:]
+    return saved
+
+
 def check_flipped(run: SyntheticRun, directory: Path, flips: list[tuple[int, int]]) -> None:
-    """Damaged bits, by place and number: what stands before them is saved, nothing wrong, and no loss is silent."""
-    whole, rows, chunks = run.writer.path.read_bytes(), rows_of(run.writer.path), chunks_of(run.writer.path)
-    path = directory / "flipped.mcap"
+    """Damaged bits, by place and number: all other chunks are saved, nothing wrong, and no loss is silent."""
+    whole, rows, path = run.writer.path.read_bytes(), rows_of(run.writer.path), directory / "flipped.mcap"
     for place, bit in flips:
         data = bytearray(whole)
         data[place] ^= 1 << bit
         path.write_bytes(data)
         found, said = recovered(path, directory / "new")
-        assert found == rows[: len(found)], (place, bit)
         if place >= len(MAGIC):  # else it is taken for something else
-            assert len(found) >= sum(count for _, end, count in chunks if end <= place), (place, bit)
-        assert len(found) == len(rows) or said, (place, bit)
+            # What messages belong to stands before them and at the end: all are saved but those of a damaged chunk,
+            # and even those where only its times are damaged.
+            left = whole_rows(run, lambda start, end, place=place: start <= place < end)
+            assert found in (left, rows), (place, bit)
+        assert found == rows or said, (place, bit)
 
 
-def test_flipped_bits_lose_only_what_stands_behind_them(run: SyntheticRun, tmp_path: Path) -> None:
+def test_flipped_bits_lose_only_the_chunk_that_they_stand_in(run: SyntheticRun, tmp_path: Path) -> None:
     pick, size = random.Random(13), run.writer.path.stat().st_size
     check_flipped(run, tmp_path, [(pick.randrange(size), pick.randrange(8)) for _ in range(34)])
 
@@ -121,16 +133,36 @@ def test_a_flipped_bit_in_what_a_record_is_brings_nothing_wrong(run, tmp_path, r
     check_flipped(run, tmp_path, [(place, bit) for k, place in chosen for bit in range((first + k) % 3, 8, 3)])
 
 
-def test_a_hole_in_the_middle_is_named_and_the_new_bag_knows_its_run(run: SyntheticRun, tmp_path: Path) -> None:
-    rows, chunks = rows_of(run.writer.path), chunks_of(run.writer.path)
-    data = bytearray(run.writer.path.read_bytes())
+def test_what_follows_a_hole_in_the_middle_is_saved_too(run: SyntheticRun, tmp_path: Path) -> None:
+    """Whether there is an index or not; channels that were defined in the hole are those of the index."""
+    rows, chunks, whole = rows_of(run.writer.path), chunks_of(run.writer.path), run.writer.path.read_bytes()
     (start, _, _), (_, end, _) = chunks[1], chunks[2]
-    data[start:end] = bytes(end - start)
-    (tmp_path / "hole.mcap").write_bytes(data)
-    found, said = recovered(tmp_path / "hole.mcap", tmp_path / "new")
-    assert found == rows[: chunks[0][2]]
-    assert said[0].startswith(f"what stands at byte {start} cannot be read")
-    assert said[1] == f"{len(rows) - chunks[0][2]} of the {len(rows)} messages that the file had are lost"
+    left = whole_rows(run, lambda begin, _: start <= begin < end)
+    last_s = max(row[1] for row in rows[: chunks[0][2]]) / 1e9
+    data = whole[:start] + bytes(end - start) + whole[end:]
+    for size in (len(data), chunks[-1][1]):
+        (tmp_path / "hole.mcap").write_bytes(data[:size])
+        found, said = recovered(tmp_path / "hole.mcap", tmp_path / "new")
+        assert found == left
+        # What stands between two chunks, an index of messages, is of no use without the chunk before it.
+        assert re.match(rf"bytes {start} to {chunks[3][0]}, after {last_s:.3f} s, cannot be read", said[0])
+        assert said[1:] == (
+            [f"{len(rows) - len(left)} of the {len(rows)} messages that the bag had are lost"]
+            if size == len(data)
+            else ["hole.mcap was not closed, or its index is damaged"]
+        )
+
+
+def test_messages_whose_channels_are_lost_are_nothing_to_save(run: SyntheticRun, tmp_path: Path) -> None:
+    (start, end, _), *_, (_, last, _) = chunks_of(run.writer.path)
+    data = run.writer.path.read_bytes()
+    (tmp_path / "bad.mcap").write_bytes(data[:start] + bytes(end - start) + data[end:last])
+    with pytest.raises(UnusableBag, match="nothing to save"):
+        recover(tmp_path / "bad.mcap", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_new_bag_knows_its_run(run: SyntheticRun, tmp_path: Path) -> None:
     source = tmp_path / "flight"
     source.mkdir()
     data = run.writer.path.read_bytes()
@@ -157,7 +189,7 @@ def test_a_whole_bag_is_copied_what_is_missing_is_counted_and_what_is_there_stay
     data[chunks[1][1] - 5] ^= 0xFF
     (tmp_path / "bad.mcap").write_bytes(data)
     result = recover(tmp_path / "bad.mcap", tmp_path / "less")
-    assert sum(result.expected.values()) - result.count == sum(count for _, _, count in chunks[1:])
+    assert sum(result.expected.values()) - result.count == chunks[1][2]
     assert not result.closed
     (tmp_path / "note").write_text("mine")
     with pytest.raises(ConfigError, match="empty or does not exist"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import signal
 import statistics
 import subprocess
@@ -13,22 +14,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from bag_helpers import (
     SECOND,
     SyntheticRun,
     as_it_arrives,
+    cdr,
     clock_ns,
     definition,
     listen,
     ros_environment,
+    stamp,
     synthetic_bag,
     synthetic_run,
 )
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
-from dtsa_bench.log.bag.metadata import PROFILES
+from dtsa_bench.log.bag.metadata import PROFILES, load_profiles
 from dtsa_bench.log.bag.reader import Bag, Message
 from dtsa_bench.log.bag.replay import Player, ros_profile
 from dtsa_bench.log.bag.writer import BagWriter
@@ -148,8 +154,8 @@ def test_impossible_rates_starts_and_topics_are_refused(run: SyntheticRun) -> No
 
 def test_a_damaged_chunk_ends_the_playing_with_an_error(run: SyntheticRun, tmp_path: Path) -> None:
     data = bytearray(run.writer.path.read_bytes())
-    with Bag(run.writer.path) as bag:
-        data[bag._chunks[-1].chunk_start_offset + 100] ^= 1
+    with run.writer.path.open("rb") as stream:
+        data[make_reader(stream).get_summary().chunk_indexes[-1].chunk_start_offset + 100] ^= 1
     (tmp_path / "bad.mcap").write_bytes(data)
     with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match="recover"):
         Player(bag, Listener(), rate=100.0).play()
@@ -237,21 +243,154 @@ def test_signals_end_a_player_cleanly(run: SyntheticRun, number: signal.Signals)
     assert "Traceback" not in error
 
 
-def test_recorded_qos_becomes_that_of_the_publisher() -> None:
+FOREVER = {"sec": 2147483647, "nsec": 4294967295}
+LATCHED = PROFILES["latched"]
+UNKNOWN = LATCHED | {"history": "unknown", "depth": 0}
+NUMBERS = LATCHED | {
+    "history": 3, "depth": 0, "reliability": 1, "durability": 1, "liveliness": 1, "deadline": FOREVER,
+    "lifespan": FOREVER, "liveliness_lease_duration": FOREVER,
+}  # fmt: skip
+
+
+def foreign_bag(path: Path, topics: dict[str, tuple[str, list[dict[str, Any]], list[tuple[int, bytes]]]]) -> Path:
+    """A file as another recorder writes it: by topic its type, the QoS of its publishers, messages and their times."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        for name, (kind, profiles, messages) in topics.items():
+            encoding = ("cdr", "ros2msg") if kind.count("/") == 2 else ("json", "jsonschema")
+            schema = writer.register_schema(kind, encoding[1], b"")
+            about = {"offered_qos_profiles": yaml.safe_dump(profiles)}
+            channel = writer.register_channel(name, encoding[0], schema, about)
+            for time_ns, data in messages:
+                writer.add_message(channel, time_ns, data, time_ns)
+        writer.finish()
+    return path
+
+
+def texts(*words: str) -> list[tuple[int, bytes]]:
+    """Messages of std_msgs/String, a tenth of a second from one to the next."""
+    return [(SECOND + k * SECOND // 10, cdr("std_msgs/msg/String", data=word)) for k, word in enumerate(words)]
+
+
+@pytest.mark.parametrize(
+    ("profiles", "wanted"),
+    [
+        ([LATCHED], (True, True, 1)),
+        ([PROFILES["sensor_data"]], (False, False, 5)),
+        ([PROFILES["reliable"], PROFILES["best_effort"]], (False, False, 10)),
+        ([PROFILES["reliable"] | {"depth": 3}, PROFILES["reliable"] | {"depth": 7}], (True, False, 7)),
+        ([PROFILES["reliable"] | {"depth": 7}, PROFILES["reliable"] | {"depth": 3}], (True, False, 7)),
+        ([], (True, False, 10)),
+        ([LATCHED, LATCHED | {"depth": 2}], (True, True, 3)),  # two publishers: a late subscriber hears of both
+        ([LATCHED, PROFILES["reliable"]], (True, True, 1)),
+        ([UNKNOWN], (True, True, 40)),
+        ([NUMBERS], (True, True, 40)),
+        ([NUMBERS | {"durability": 2, "reliability": 2}], (False, False, 10)),
+        ([PROFILES["reliable"] | {"depth": "many"}], (True, False, 10)),
+        ([LATCHED | {"history": "keep_all"}], (True, True, 40)),
+    ],
+)
+def test_recorded_qos_becomes_that_of_the_publisher(
+    profiles: list[dict[str, Any]], wanted: tuple[bool, bool, int]
+) -> None:
     pytest.importorskip("rclpy", reason="rclpy is not installed")
     from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-    latched = ros_profile([PROFILES["latched"]])
-    assert (latched.reliability, latched.durability) == (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
-    assert latched.depth == 1
-    sensor = ros_profile([PROFILES["sensor_data"]])
-    assert (sensor.reliability, sensor.depth) == (ReliabilityPolicy.BEST_EFFORT, 5)
-    mixed = ros_profile([PROFILES["reliable"], PROFILES["best_effort"]])
-    assert mixed.reliability == ReliabilityPolicy.BEST_EFFORT
-    depths = [
-        ros_profile([PROFILES["reliable"] | {"depth": depth} for depth in pair]).depth for pair in ((3, 7), (7, 3))
-    ]
-    assert depths == [7, 7]
+    found = ros_profile(load_profiles(yaml.safe_dump(profiles)), 40)
+    reliable, latched = (
+        found.reliability == ReliabilityPolicy.RELIABLE,
+        found.durability == (DurabilityPolicy.TRANSIENT_LOCAL),
+    )
+    assert (reliable, latched, found.depth) == wanted
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("profile", [NUMBERS, UNKNOWN], ids=["Humble", "Jazzy"])
+def test_a_late_subscriber_hears_all_latched_messages(tmp_path: Path, profile: dict[str, Any]) -> None:
+    need_ros()
+    from node_helpers import ros_graph
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import String
+
+    messages = texts("one", "two", "three")
+    bag = foreign_bag(
+        tmp_path / "bag.mcap",
+        {
+            "/settings": ("std_msgs/msg/String", [profile], messages),
+            "/tick": ("std_msgs/msg/String", [], [*messages, (600 * SECOND, messages[0][1])]),
+        },
+    )
+    with ros_graph(tmp_path) as graph:
+        early: list[str] = []
+        late: list[str] = []
+        graph.node.create_subscription(String, "/settings", lambda m: early.append(m.data), QoSProfile(depth=10))
+        player = start_replay(bag, "--wait-for-subscriber", env=graph.environment)
+        try:
+            graph.until(lambda: len(early) == 3)
+            latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            graph.node.create_subscription(String, "/settings", lambda m: late.append(m.data), latched)
+            graph.until(lambda: len(late) == 3)
+            player.send_signal(signal.SIGINT)
+            assert player.wait(30) == 0
+        finally:
+            player.kill()
+            player.communicate()
+    assert early == late == ["one", "two", "three"]
+
+
+@pytest.mark.ros
+def test_a_recorded_clock_is_the_only_one_and_what_cannot_be_played_is_left_out(tmp_path: Path) -> None:
+    need_ros()
+    from node_helpers import ros_graph
+    from rosgraph_msgs.msg import Clock
+
+    times = [500 * SECOND + k * SECOND // 10 for k in range(8)]  # not those of the recording
+    clocks = [cdr("rosgraph_msgs/msg/Clock", clock=stamp(time_ns)) for time_ns in times]
+    bag = foreign_bag(
+        tmp_path / "bag.mcap",
+        {
+            "/clock": ("rosgraph_msgs/msg/Clock", [], [(SECOND + k * SECOND // 10, c) for k, c in enumerate(clocks)]),
+            "/text": ("std_msgs/msg/String", [], texts("a")),
+            "/odd": ("no_such_msgs/msg/Thing", [], texts("a")),
+            "/missing": ("std_msgs/msg/NoSuchThing", [], texts("a")),
+            "/service/_service_event": ("std_srvs/srv/SetBool_Event", [], texts("a")),
+            "/notes": ("Note", [], texts("a")),
+        },
+    )
+    with ros_graph(tmp_path) as graph:
+        found: list[int] = []
+        publishers: set[int] = set()
+        graph.node.create_subscription(
+            Clock, "/clock", lambda m: found.append(m.clock.sec * SECOND + m.clock.nanosec), 100
+        )
+        player = start_replay(bag, "--wait-for-subscriber", env=graph.environment)
+        graph.until(lambda: publishers.add(graph.node.count_publishers("/clock")) or player.poll() is not None)
+        out, error = player.communicate()
+    assert player.returncode == 0, error
+    assert "playing 2 topics" in out
+    assert "played 9 messages" in out
+    assert found == times
+    assert publishers <= {0, 1}
+    warnings = [line for line in error.splitlines() if "is left out" in line]
+    assert [line.split()[2] for line in warnings] == ["/odd", "/missing", "/service/_service_event", "/notes"]
+    player = start_replay(bag, "--topics", "/odd")
+    assert "none of the topics can be played" in player.communicate()[1]
+    assert player.returncode == 1
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("name", ["/cf1/odom-raw", "/1st", "/a//b"])
+def test_a_topic_that_ros_forbids_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    need_ros()
+    text = ("std_msgs/msg/String", [], texts("a"))
+    bag = foreign_bag(tmp_path / "bag.mcap", {name: text, "/text": text})
+    player = start_replay(bag)
+    error = player.communicate()[1]
+    assert player.returncode == 2
+    assert re.search(rf"topic: got '{name}'.*leave it out with --topics", error)
+    assert len(error.splitlines()) == 1
+    assert "played 1 messages" in start_replay(bag, "--topics", "/text").communicate()[0]
 
 
 @pytest.mark.ros

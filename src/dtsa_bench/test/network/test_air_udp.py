@@ -27,6 +27,7 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import read
 from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.merge.merge import Merge, verified
 from dtsa_bench.log.merge.timeline import Crossing, fit
@@ -211,6 +212,11 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Pa
     found = Merge([bag, *(read(path) for path in flight.bags[1:])]).judge()
     assert found["broken_off"] == ["cf1"]
     assert verified(found)
+    saved = read(recover(cut).directory)
+    assert [record.slot for record in saved.slots] == [record.slot for record in bag.slots]
+    again = Merge([saved, *(read(path) for path in flight.bags[1:])]).judge()
+    assert {**again, "broken_off": []} == {**found, "broken_off": []}, again
+    assert again["broken_off"] == ["cf1"]
     for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
         cut.write_bytes(bad)
         with pytest.raises(DtsaError):

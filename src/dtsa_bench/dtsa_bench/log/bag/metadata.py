@@ -1,17 +1,22 @@
-"""`metadata.yaml` of a bag directory, version 9, as Jazzy writes it."""
+"""Where a bag is, and its metadata: `metadata.yaml`, version 9, as Jazzy writes it, and profiles of QoS."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 import yaml
+import zstandard
+from mcap.records import Metadata
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
 
-from dtsa_agent.core.errors import ConfigError
+from .errors import UnusableBag
 
 VERSION = 9
 ROOT = "rosbag2_bagfile_information"
@@ -21,71 +26,94 @@ RECORD_KEY = "serialized_metadata"
 RUN_ID = "run"  # name of the run's id in custom data, 8 hexadecimal digits
 MERGED_FROM = "merged_from"  # custom data of a bag that was made from the bags of agents on a network, as JSON
 RECOVERED_FROM = "recovered_from"  # custom data of a bag that `recover` has made: name of the damaged file
+MAX_UNPACKED_BYTES = 1 << 36  # of a file that is compressed as a whole
+MAX_MESSAGE_BYTES = 1 << 30  # of a message that is compressed by itself; for one that does not say its size
+_SQLITE = "an sqlite3 bag; `rosbags-convert --src {} --dst NEW --dst-storage mcap` makes an mcap bag of it"
+_PART = re.compile(r"(.*)_(\d+)\.mcap(?:\.zstd)?")
+
+Profile = dict[str, Any]  # quality of service of a publisher, with the fields of rosbag2
 
 
-@dataclass(frozen=True, slots=True)
-class TopicSummary:
-    """One topic of a bag, for its metadata."""
-
-    name: str
-    type: str
-    profiles: Sequence[Profile]
-    type_hash: str
-    count: int  # messages
+# -- files ------------------------------------------------------------------------------------------------------------
+def bag_of(path: str | Path) -> Path:
+    """The bag of what was given as a recorded run: that in a run's directory; anything else as it is."""
+    given = Path(path)
+    inner = given / "bag"
+    return inner if inner.is_dir() and not any(given.glob("*.mcap*")) else given
 
 
-def build(
-    file_name: str,
-    topics: Sequence[TopicSummary],
-    start_ns: int,
-    end_ns: int,
-    custom_data: Mapping[str, str],
-    ros_distro: str = "jazzy",
-) -> dict[str, Any]:
-    """The whole map below the root key.
+def find_files(path: str | Path) -> list[Path]:
+    """The files of what was given as a recorded run, in their order: .mcap, or .mcap.zstd where compressed as a whole.
 
-    :param start_ns: log time of the first message, ns; 0 in an empty bag.
+    :raises UnusableBag: if there is none, or several that are not the parts of one bag.
     """
-    count = sum(topic.count for topic in topics)
-    starting_time = {"nanoseconds_since_epoch": start_ns}
-    duration = {"nanoseconds": max(0, end_ns - start_ns)}
-    return {
-        "version": VERSION,
-        "storage_identifier": "mcap",
-        "duration": duration,
-        "starting_time": starting_time,
-        "message_count": count,
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {
-                    "name": topic.name,
-                    "type": topic.type,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": [dict(entry) for entry in topic.profiles],
-                    "type_description_hash": topic.type_hash,
-                },
-                "message_count": topic.count,
-            }
-            for topic in topics
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": [file_name],
-        "files": [
-            {
-                "path": file_name,
-                "starting_time": dict(starting_time),
-                "duration": dict(duration),
-                "message_count": count,
-            }
-        ],
-        "custom_data": {str(key): str(value) for key, value in custom_data.items()},
-        "ros_distro": ros_distro,
-    }
+    path = bag_of(path)
+    if not path.exists():
+        raise UnusableBag(path, "there is no such file or directory")
+    if not path.is_dir():
+        if path.suffix == ".db3":
+            raise UnusableBag(path, _SQLITE.format(path.parent))
+        return [path]
+    plain = {file.name: file for file in path.glob("*.mcap")}
+    packed = {file.name: file for file in path.glob("*.mcap.zstd") if file.stem not in plain}
+    files = list({**plain, **packed}.values())
+    if len(files) > 1:
+        return _parts(path, files)
+    if not files:
+        if any(path.glob("*.db3")):
+            raise UnusableBag(path, _SQLITE.format(path))
+        below = sorted(entry.parent.name for entry in path.glob("*/*.mcap"))
+        hint = f"; did you mean one of {', '.join(below[:5])} in it?" if below else ""
+        raise UnusableBag(path, f"the directory holds no .mcap file{hint}")
+    return files
 
 
+def _parts(directory: Path, files: Sequence[Path]) -> list[Path]:
+    """The files of a bag that was split, in their order: those of metadata.yaml, else X_0.mcap, X_1.mcap, ..."""
+    listed = read(directory).get("relative_file_paths")
+    if isinstance(listed, list) and listed:
+        found = {file.name.removesuffix(".zstd"): file for file in files}
+        names = [Path(str(name)).name for name in listed]
+        missing = [name for name in names if name.removesuffix(".zstd") not in found]
+        if missing:
+            raise UnusableBag(directory, f"{', '.join(missing[:5])}, which {FILE_NAME} names, is missing: name a file")
+        return [found[name.removesuffix(".zstd")] for name in names]
+    parts = {int(match[2]): file for file in files if (match := _PART.fullmatch(file.name))}
+    stems = {file.name.rpartition("_")[0] for file in files}
+    if len(stems) == 1 and sorted(parts) == list(range(len(files))):
+        return [file for _, file in sorted(parts.items())]
+    raise UnusableBag(directory, f"holds {len(files)} .mcap files that are not the parts of one bag: name one of them")
+
+
+def open_file(path: Path) -> IO[bytes]:
+    """A bag's file, open for reading; one that is compressed as a whole is unpacked, as far as that is possible.
+
+    :raises UnusableBag: if it cannot be read, or is too large.
+    """
+    try:
+        if path.suffix != ".zstd":
+            return path.open("rb")
+        with ExitStack() as stack:
+            unpacked = stack.enter_context(TemporaryFile())
+            with (
+                path.open("rb") as packed,
+                suppress(zstandard.ZstdError),
+            ):  # of a damaged file the beginning is unpacked
+                reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+                while block := reader.read(1 << 20):
+                    unpacked.write(block)
+                    if unpacked.tell() > MAX_UNPACKED_BYTES:
+                        raise UnusableBag(path, f"it is larger than {MAX_UNPACKED_BYTES >> 30} GiB when unpacked")
+            unpacked.seek(0)
+            stack.pop_all()
+            return unpacked
+    except OSError as error:
+        raise UnusableBag(path, f"cannot be read: {error.strerror or error}") from None
+
+
+# -- metadata ---------------------------------------------------------------------------------------------------------
+_TextLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # every value as it is written: 1.10 and 007 stay texts
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_TextLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # every value as it is written
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
@@ -101,18 +129,44 @@ def dump(content: Mapping[str, Any]) -> str:
 
 
 def load(text: str) -> dict[str, Any]:
-    """A metadata map from its YAML text; empty if the text is none."""
+    """A metadata map from its YAML text, all values as texts; empty if the text is none."""
     try:
-        loaded = yaml.load(text, Loader=_Loader)
-        if not isinstance(loaded, dict):
-            return {}
-        custom = loaded.get("custom_data")
-        if isinstance(custom, dict) and not all(isinstance(entry, str) for pair in custom.items() for entry in pair):
-            # rosbag2 writes these texts without quotes: 1.10 and 007 stay what they are, not 1.1 and 7.
-            loaded["custom_data"] = yaml.load(text, Loader=_TextLoader)["custom_data"]
-    except yaml.YAMLError:
+        loaded = yaml.load(text, Loader=_TextLoader)
+    except (yaml.YAMLError, RecursionError):
         return {}
-    return loaded
+    return loaded if isinstance(loaded, dict) else {}
+
+
+def load_record(record: Metadata) -> dict[str, Any]:
+    """What rosbag2's metadata record inside a file says."""
+    return load(record.metadata.get(RECORD_KEY, ""))
+
+
+def read(directory: Path) -> dict[str, Any]:
+    """What `metadata.yaml` in a directory says, all values as texts; empty if there is none."""
+    try:
+        content = load((directory / FILE_NAME).read_text(encoding="utf-8")).get(ROOT)
+    except (OSError, UnicodeError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def read_beside(file: Path, given: str | Path) -> dict[str, Any]:
+    """What `metadata.yaml` beside a file says, if it is of the bag that was given."""
+    content = read(file.parent)
+    names = content.get("relative_file_paths")
+    listed = isinstance(names, list) and file.name in (Path(str(name)).name for name in names)
+    return content if listed or Path(given).is_dir() else {}
+
+
+def has_packed_messages(content: Mapping[str, Any]) -> bool:
+    """Whether rosbag2 compressed each message by itself."""
+    return str(content.get("compression_mode", "")).lower() == "message"
+
+
+def unpack_message(data: bytes) -> bytes:
+    """One message that rosbag2 compressed by itself; raises ZstdError for a damaged one."""
+    return zstandard.ZstdDecompressor().decompress(data, max_output_size=MAX_MESSAGE_BYTES)
 
 
 def custom_data(content: Mapping[str, Any]) -> dict[str, str]:
@@ -121,79 +175,55 @@ def custom_data(content: Mapping[str, Any]) -> dict[str, str]:
     return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
 
 
-def has_packed_messages(content: Mapping[str, Any]) -> bool:
-    """Whether a bag's metadata says that rosbag2 compressed each message by itself."""
-    return str(content.get("compression_mode", "")).lower() == "message"
-
-
-def write(directory: Path, content: Mapping[str, Any]) -> Path:
+def write(directory: Path, content: Mapping[str, Any]) -> None:
     """Write `metadata.yaml` so that it is either whole or absent: temporary file, then rename."""
-    path = directory / FILE_NAME
     temporary = directory / f".{FILE_NAME}.part"
     with temporary.open("w", encoding="utf-8") as stream:
         stream.write(dump({ROOT: content}))
         stream.flush()
         os.fsync(stream.fileno())
-    temporary.replace(path)
-    return path
+    temporary.replace(directory / FILE_NAME)
 
 
-# The middleware's "for ever" (RMW_DURATION_INFINITE), split as rosbag2 splits it.
-INFINITE = {"sec": 9223372036, "nsec": 854775807}
-Profile = dict[str, Any]
+# -- quality of service -----------------------------------------------------------------------------------------------
+INFINITE = {"sec": 9223372036, "nsec": 854775807}  # the middleware's "for ever", as rosbag2 splits it
+_POLICIES = {
+    "history": QosHistory, "reliability": QosReliability, "durability": QosDurability, "liveliness": QosLiveliness,
+}  # fmt: skip
 
 
-def profile(reliability: str = "reliable", durability: str = "volatile", depth: int = 10) -> Profile:
-    """One QoS profile with all the fields that rosbag2 stores."""
-    return {
-        "history": "keep_last",
-        "depth": depth,
-        "reliability": reliability,
-        "durability": durability,
-        "deadline": dict(INFINITE),
-        "lifespan": dict(INFINITE),
-        "liveliness": "automatic",
-        "liveliness_lease_duration": dict(INFINITE),
-        "avoid_ros_namespace_conventions": False,
-    }
-
-
+_PROFILE: Profile = {
+    "history": "keep_last", "depth": 10, "reliability": "reliable", "durability": "volatile", "deadline": INFINITE,
+    "lifespan": INFINITE, "liveliness": "automatic", "liveliness_lease_duration": INFINITE,
+    "avoid_ros_namespace_conventions": False,
+}  # fmt: skip
 PROFILES: Mapping[str, Profile] = {
-    "reliable": profile(),
-    "best_effort": profile("best_effort"),
-    "sensor_data": profile("best_effort", depth=5),
-    "latched": profile("reliable", "transient_local", 1),
+    "reliable": _PROFILE,
+    "best_effort": _PROFILE | {"reliability": "best_effort"},
+    "sensor_data": _PROFILE | {"reliability": "best_effort", "depth": 5},
+    "latched": _PROFILE | {"durability": "transient_local", "depth": 1},
 }
-
-
-def resolve_profiles(qos: str | Profile | Sequence[Profile]) -> list[Profile]:
-    """List of profiles from a name of `PROFILES`, one profile or several.
-
-    :raises ConfigError: if the name is unknown.
-    """
-    if isinstance(qos, str):
-        if qos not in PROFILES:
-            raise ConfigError("qos", qos, ", ".join(PROFILES))
-        return [dict(PROFILES[qos])]
-    if isinstance(qos, Mapping):
-        return [dict(qos)]
-    return [dict(entry) for entry in qos]
 
 
 def dump_profiles(profiles: Sequence[Profile]) -> str:
     """The YAML sequence that a channel carries as `offered_qos_profiles`."""
-    return str(yaml.safe_dump(list(profiles), sort_keys=False)).rstrip("\n") if profiles else ""
-
-
-def load_profiles(text: str) -> list[Profile]:
-    """Profiles from a channel's `offered_qos_profiles`; an unreadable text gives none."""
-    return [dict(entry) for entry in _parse(text)]
+    return dump(list(profiles)).rstrip("\n") if profiles else ""  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=64)  # the topics of a bag share a few texts, and YAML is slow
-def _parse(text: str) -> tuple[Profile, ...]:
+def load_profiles(text: str) -> tuple[Profile, ...]:
+    """Profiles from a channel's `offered_qos_profiles`, with names of policies; an unreadable text gives none.
+
+    Before Jazzy rosbag2 wrote policies as numbers.
+    """
     try:
-        loaded = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)) if text else []
-    except yaml.YAMLError:
+        loaded = yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError):
         return ()
-    return tuple(entry for entry in loaded if isinstance(entry, dict)) if isinstance(loaded, list) else ()
+    profiles = [dict(entry) for entry in loaded if isinstance(entry, dict)] if isinstance(loaded, list) else []
+    for entry in profiles:
+        for name, policy in _POLICIES.items():
+            numbers = {member.value: member.name.lower() for member in policy}
+            if isinstance(entry.get(name), int):
+                entry[name] = numbers.get(entry[name], "unknown")
+    return tuple(profiles)

@@ -1,56 +1,45 @@
-"""Reads bags back, without ROS: messages in order of time, decoded by the definitions in the bag itself."""
+"""Reads bags back, without ROS: messages in order of time, decoded by the definitions in the bag itself.
+
+A bag may be several files, or files that are compressed as a whole, or hold messages that are compressed one by one:
+all that rosbag2 writes to MCAP, as long as it has an index.
+"""
 
 from __future__ import annotations
 
+import heapq
 import json
 import struct
-from collections.abc import Collection, Iterator
-from contextlib import suppress
+import zlib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Chunk, ChunkIndex
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Channel, Chunk, Schema
+from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
 from dtsa_bench.runs.program import program
 
 from . import columns, metadata
 from .errors import BagError, UnusableBag
-from .place import find_file
+from .schema import Definition
 
-PACKED_MESSAGES = "its messages are compressed one by one; `ros2 bag convert` makes a plain bag of it"
-MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
-_ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
-_MESSAGE = struct.Struct("<BQHIQQ")  # a message record up to its data
-
-
-class _Entry(NamedTuple):
-    """One message inside a chunk."""
-
-    log_time_ns: int
-    chunk: int  # offset of the chunk in the file: with `start`, the order in which messages were written
-    start: int  # offset of the data in the uncompressed chunk
-    end: int
-    channel: int
-    sequence: int
-    publish_time_ns: int
-    buffer: bytes  # the uncompressed chunk
+_END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
+_ROS = "cdr/ros2msg"
+_MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
+_ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
 
 class Message(NamedTuple):
@@ -74,6 +63,7 @@ class Topic:
     profiles: tuple[metadata.Profile, ...]  # offered QoS
     type_hash: str  # "RIHS01_...", or empty
     definition: str  # message definition with all that it needs
+    encoding: str  # of messages and definition; "cdr/ros2msg" alone can be decoded
 
 
 class Bag:
@@ -85,83 +75,96 @@ class Bag:
 
     def __init__(self, path: str | Path) -> None:
         self.given = Path(path)
-        self.path = find_file(self.given)
-        try:
-            self._stream = self.path.open("rb")
-        except OSError as error:
-            raise UnusableBag(path, f"cannot be read: {error.strerror or error}") from None
-        try:
-            self._open()
-        except BaseException:
-            self._stream.close()
-            raise
+        paths = metadata.find_files(self.given)
+        self.path = paths[0]
+        with ExitStack() as stack:
+            self._open([(part, stack.enter_context(metadata.open_file(part))) for part in paths])
+            self._files = stack.pop_all()
 
-    def _open(self) -> None:
-        if self._stream.read(len(MAGIC)) != MAGIC:
-            raise UnusableBag(self.given, f"{self.path.name} is not an MCAP file")
-        self._stream.seek(0)
-        try:
-            self._reader = SeekingReader(self._stream)
-            self.header = self._reader.get_header()
-            self._stream.seek(-len(MAGIC), 2)
-            if self._stream.read() != MAGIC:
-                raise McapError("no end mark")
-            summary = self._reader.get_summary()
-        except Exception as error:  # the library meets damaged files with many kinds of errors
-            raise self._damaged(f"it was not closed, or is damaged ({error or type(error).__name__})") from None
-        if summary is None or summary.statistics is None:
-            raise self._damaged("it has no index")
-        if summary.statistics.message_count and not summary.chunk_indexes:
-            raise self._damaged("its messages are not in indexed chunks")
-        self._read_topics(summary)
-        record = self._read_record()
-        if metadata.has_packed_messages(record):
-            raise UnusableBag(self.given, PACKED_MESSAGES)
-        self.custom_data = metadata.custom_data(record)  # the recorder's own texts; empty in a foreign bag
-        statistics = summary.statistics
-        self.message_count: int = statistics.message_count
-        self.start_ns: int = statistics.message_start_time
-        self.end_ns: int = statistics.message_end_time
-        self._chunks: list[ChunkIndex] = sorted(
-            summary.chunk_indexes, key=lambda index: (index.message_start_time, index.chunk_start_offset)
-        )
+    def _open(self, files: list[tuple[Path, IO[bytes]]]) -> None:
+        self._parts: list[tuple[IO[bytes], SeekingReader, Summary]] = []  # a file each
+        self.topics: dict[str, Topic] = {}
+        for path, stream in files:
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise UnusableBag(self.given, f"{path.name} is not an MCAP file")
+            try:
+                stream.seek(-len(MAGIC), 2)
+                if stream.read() != MAGIC:
+                    raise McapError("no end mark")
+                reader, summary = read_index(stream)
+                reader.get_header()
+            except Exception as error:  # the library meets damaged files with many kinds of errors
+                raise self._damaged(f"it was not closed, or is damaged ({error or type(error).__name__})") from None
+            if summary is None or summary.statistics is None:
+                raise self._damaged("it has no index")
+            if summary.statistics.message_count and not summary.chunk_indexes:
+                raise self._damaged("its messages are not in indexed chunks")
+            counts = {number: count for number, count in summary.statistics.channel_message_counts.items() if count}
+            self._find_channels(summary, counts, stream)
+            self._add_topics(summary, counts)
+            self._parts.append((stream, reader, summary))
+        if self.topics and all(topic.encoding != _ROS for topic in self.topics.values()):
+            topic = next(iter(self.topics.values()))
+            raise UnusableBag(
+                self.given, f"topic {topic.name} is recorded as {topic.encoding}, not as {_ROS}: not a ROS 2 bag"
+            )
+        statistics = [summary.statistics for _, _, summary in self._parts if summary.statistics]
+        self.message_count = sum(part.message_count for part in statistics)
+        self.start_ns: int = min((part.message_start_time for part in statistics if part.message_count), default=0)
+        self.end_ns: int = max(part.message_end_time for part in statistics)
+        records = self._records()
+        self._has_packed_messages = any(map(metadata.has_packed_messages, records))
+        #: The recorder's own texts; empty in a foreign bag.
+        self.custom_data = next(filter(None, map(metadata.custom_data, records)), {})
 
     def _damaged(self, what: str) -> UnusableBag:
         return UnusableBag(self.given, f"{what}; `{program()} recover {self.given}` saves what can be read")
 
-    def _read_topics(self, summary: Summary) -> None:
-        counts = summary.statistics.channel_message_counts if summary.statistics else {}
-        self.topics: dict[str, Topic] = {}
-        self._channels: dict[int, tuple[str, str]] = {}
-        for identifier, channel in sorted(summary.channels.items()):
-            schema = summary.schemas.get(channel.schema_id)
-            if channel.message_encoding != "cdr" or schema is None or schema.encoding != "ros2msg":
-                if schema is not None and schema.name.startswith(_ON_A_NETWORK):
-                    raise UnusableBag(self.given, MERGED.format(program()))
-                encoding = f"{channel.message_encoding}/{schema.encoding if schema else 'no schema'}"
-                raise UnusableBag(
-                    self.given,
-                    f"topic {channel.topic} is recorded as {encoding}, not as cdr/ros2msg: not a ROS 2 bag",
-                )
+    def _find_channels(self, summary: Summary, counts: Mapping[int, int], stream: IO[bytes]) -> None:
+        """Complete a summary that repeats no channels or schemas by those that stand before the messages."""
+        for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+            channels = [summary.channels.get(number) for number in counts]
+            if all(channel and channel.schema_id in (0, *summary.schemas) for channel in channels):
+                return
+            try:
+                stream.seek(index.chunk_start_offset + PREFIX.size)
+                records = breakup_chunk(Chunk.read(ReadDataStream(stream)), validate_crc=True)
+            except Exception as error:  # the libraries meet damage with many kinds of errors
+                raise self._damaged(f"damaged chunk at byte {index.chunk_start_offset}: {error}") from None
+            for record in records:
+                if isinstance(record, Schema):
+                    summary.schemas.setdefault(record.id, record)
+                elif isinstance(record, Channel):
+                    summary.channels.setdefault(record.id, record)
+        if not counts.keys() <= summary.channels.keys():
+            raise self._damaged("the channels of some messages are not defined")
+
+    def _add_topics(self, summary: Summary, counts: Mapping[int, int]) -> None:
+        for number, channel in sorted(summary.channels.items()):
+            definition = definition_of(channel, summary.schemas.get(channel.schema_id))
+            if definition.name.startswith(_ON_A_NETWORK):
+                raise UnusableBag(self.given, _MERGED.format(program()))
             before = self.topics.get(channel.topic)
+            profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
             self.topics[channel.topic] = Topic(
                 channel.topic,
-                schema.name,
-                counts.get(identifier, 0) + (before.count if before else 0),
-                tuple(metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))),
-                channel.metadata.get("topic_type_hash", ""),
-                schema.data.decode("utf-8", "replace"),
+                definition.name,
+                counts.get(number, 0) + (before.count if before else 0),
+                profiles or (before.profiles if before else ()),
+                definition.type_hash,
+                definition.text,
+                f"{definition.message_encoding}/{definition.encoding or 'no schema'}",
             )
-            self._channels[identifier] = (channel.topic, schema.name)
 
-    def _read_record(self) -> dict[str, Any]:
-        """What the recorder stored beside the messages; empty where there is nothing, or it is damaged."""
-        found: dict[str, Any] = {}
-        with suppress(McapError, struct.error, ValueError, KeyError, OSError, StopIteration, MemoryError):
-            for record in self._reader.iter_metadata():
-                if record.name == metadata.RECORD_NAME:
-                    found = metadata.load(record.metadata.get(metadata.RECORD_KEY, ""))
-        return found
+    def _records(self) -> list[dict[str, Any]]:
+        """What the recorder stored beside the messages: in the files, then in `metadata.yaml`, if that is of them."""
+        records = []
+        for _, reader, _ in self._parts:
+            with suppress(Exception):  # of a damaged record: whatever the library meets, there is none then
+                for record in reader.iter_metadata():
+                    if record.name == metadata.RECORD_NAME:
+                        records.insert(0, metadata.load_record(record))
+        return [*records, metadata.read_beside(self.path, self.given)]
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -180,61 +183,29 @@ class Bag:
     def messages(
         self, topics: Collection[str] | None = None, start_ns: int = 0, end_ns: int = (1 << 63) - 1
     ) -> Iterator[Message]:
-        """Messages in order of log time, those of equal time as recorded; about two chunks are in memory.
+        """Messages in order of log time, those of equal time as recorded; about two chunks of a file are in memory.
 
         :param topics: names; None: all.
         :param start_ns: ns, earliest log time.
         :param end_ns: ns, latest log time.
-        :raises ConfigError: if a topic is not in the bag.
-        :raises UnusableBag: if a chunk is damaged.
+        :raises UnusableBag: if a topic is not in the bag, or a chunk is damaged.
         """
-        if topics is not None:
-            for name in topics:
-                self.topic(name)
-        wanted = {
-            identifier: names for identifier, names in self._channels.items() if topics is None or names[0] in topics
-        }
-        waiting: list[_Entry] = []
-        for entry in self._entries(wanted, start_ns, end_ns, waiting):
-            topic, kind = wanted[entry.channel]
-            data = entry.buffer[entry.start : entry.end]
-            yield Message(topic, kind, entry.log_time_ns, entry.publish_time_ns, entry.sequence, data)
+        for name in topics or ():
+            self.topic(name)
+        wanted = None if topics is None else set(topics)
+        parts = [self._messages(reader, wanted, start_ns, end_ns) for _, reader, _ in self._parts]
+        return heapq.merge(*parts, key=lambda message: message.log_time_ns) if len(parts) > 1 else parts[0]
 
-    def _entries(self, wanted: Collection[int], start_ns: int, end_ns: int, waiting: list[_Entry]) -> Iterator[_Entry]:
-        chunks = [
-            index
-            for index in self._chunks
-            if index.message_end_time >= start_ns
-            and index.message_start_time <= end_ns
-            and (not index.message_index_offsets or any(c in wanted for c in index.message_index_offsets))
-        ]
-        for index in chunks:
-            # What is earlier than all that follows can go out; chunks may overlap in time.
-            ready = 0
-            while ready < len(waiting) and waiting[ready].log_time_ns < index.message_start_time:
-                ready += 1
-            yield from waiting[:ready]
-            del waiting[:ready]
-            waiting += [
-                entry
-                for entry in _messages(self._chunk(index), index.chunk_start_offset)
-                if entry.channel in wanted and start_ns <= entry.log_time_ns <= end_ns
-            ]
-            waiting.sort(key=lambda entry: entry[:3])
-        yield from waiting
-
-    def _chunk(self, index: ChunkIndex) -> bytes:
-        """The uncompressed records of a chunk."""
+    def _messages(
+        self, reader: SeekingReader, wanted: set[str] | None, start_ns: int, end_ns: int
+    ) -> Iterator[Message]:
+        unpack = metadata.unpack_message if self._has_packed_messages else bytes
         try:
-            self._stream.seek(index.chunk_start_offset)
-            record = self._stream.read(index.chunk_length)
-            if len(record) != index.chunk_length or record[0] != Opcode.CHUNK:
-                raise ValueError("it is not where the index says")
-            chunk = Chunk.read(ReadDataStream(BytesIO(record[PREFIX.size :])))
-            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-            return stream.read(length)
-        except Exception as error:  # the library meets damage with many kinds of errors
-            raise self._damaged(f"damaged chunk at byte {index.chunk_start_offset}: {error}") from None
+            for schema, channel, message in reader.iter_messages(wanted, starting_at=start_ns, ending_at=end_ns):
+                kind, data = schema.name if schema else "", unpack(message.data)
+                yield Message(channel.topic, kind, message.log_time, message.publish_time, message.sequence, data)
+        except Exception as error:  # the libraries meet damage with many kinds of errors
+            raise self._damaged(f"damaged chunk: {error or type(error).__name__}") from None
 
     def topic(self, name: str) -> Topic:
         """One topic by name.
@@ -249,26 +220,42 @@ class Bag:
 
     @cached_property
     def typestore(self) -> Typestore:
-        """Decoder of all message types in this bag, made from the definitions in it."""
+        """Decoder of the message types in this bag, made from those definitions in it that can be used."""
         store = get_typestore(Stores.EMPTY)
+        self._unusable: dict[str, str] = {}  # why a type cannot be decoded
         for topic in self.topics.values():
-            if topic.type in store.types:
-                continue
-            try:
-                found = get_types_from_msg(topic.definition, topic.type)
-                store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
-            except (TypesysError, SyntaxError) as error:
-                raise UnusableBag(self.given, f"the definition of {topic.type} cannot be used: {error}") from None
+            if topic.encoding != _ROS:
+                self._unusable[topic.type] = f"it is recorded as {topic.encoding}, not as {_ROS}"
+            elif topic.type not in store.fielddefs:
+                try:
+                    types = get_types_from_msg(topic.definition, topic.type)
+                    store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
+                    if topic.type not in store.fielddefs:
+                        raise ValueError("it is not of the form package/msg/Type")
+                except Exception as error:  # the parser meets texts from outside with many kinds of errors
+                    self._unusable[topic.type] = f"its definition cannot be used: {error}".partition("\n")[0]
         return store
+
+    def _decodable(self, topic: str) -> Topic:
+        """A topic whose messages can be decoded.
+
+        :raises UnusableBag: if they cannot.
+        """
+        found = self.topic(topic)
+        if found.type not in self.typestore.fielddefs:
+            raise UnusableBag(self.given, f"topic {topic}, {found.type}: {self._unusable[found.type]}")
+        return found
 
     def decode(self, message: Message) -> Any:
         """The message as an object with its fields as attributes; arrays of numbers are NumPy arrays.
 
+        :raises UnusableBag: if its definition cannot be used.
         :raises BagError: if the bytes do not fit the type.
         """
         try:
             return self.typestore.deserialize_cdr(message.data, message.type)
         except (SerdeError, AssertionError, IndexError, KeyError) as error:
+            self._decodable(message.topic)
             raise BagError(
                 f"{message.topic} at {message.log_time_ns} ns: not a valid {message.type} ({error})"
             ) from None
@@ -300,7 +287,7 @@ class Bag:
         :param fields: names of fields to keep, of whatever topic; None: all.
         """
         found = {
-            name: columns.Table(self.typestore, self.topic(name).type, fields)
+            name: columns.Table(self.typestore, self._decodable(name).type, fields)
             for name in (self.topics if topics is None else topics)
         }
         for message in self.messages(list(found)):
@@ -308,36 +295,31 @@ class Bag:
         return {name: table.finish() for name, table in found.items()}
 
     def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
+        """Close the files."""
+        self._files.close()
 
     def __enter__(self) -> Bag:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *unused: object) -> None:
         self.close()
 
 
-def _messages(buffer: bytes, chunk: int = 0) -> Iterator[_Entry]:
-    """All whole messages in uncompressed records, as they were written.
+def read_index(stream: IO[bytes]) -> tuple[SeekingReader, Summary | None]:
+    """A reader and the index at the end of a file, None if it has none; raises errors of any kind for a damaged one."""
+    stream.seek(-_END.size, 2)
+    start, _, checksum, _ = _END.unpack(stream.read())
+    stream.seek(start)
+    if start and checksum and zlib.crc32(stream.read()[:-12]) != checksum:  # it covers all that stands before it
+        raise McapError("its index does not fit its checksum")
+    stream.seek(0)
+    reader = SeekingReader(stream, validate_crcs=True)
+    return reader, reader.get_summary()
 
-    :param chunk: bytes, offset of their chunk in the file.
-    """
-    position, size = 0, len(buffer)
-    unpack, head, kind = _MESSAGE.unpack_from, _MESSAGE.size, int(Opcode.MESSAGE)
-    least = head - PREFIX.size
-    while position + PREFIX.size <= size:
-        if buffer[position] == kind and position + head <= size:
-            _, length, channel, sequence, log_ns, publish_ns = unpack(buffer, position)
-            end = position + PREFIX.size + length
-            if length < least or end > size:
-                return
-            yield _Entry(log_ns, chunk, position + head, end, channel, sequence, publish_ns, buffer)
-        else:
-            opcode, length = PREFIX.unpack_from(buffer, position)
-            end = position + PREFIX.size + length
-            if opcode in (0, kind) or end > size:
-                return
-        position = end
+
+def definition_of(channel: Channel, schema: Schema | None) -> Definition:
+    """What a file says of the type of a channel's messages."""
+    type_hash, encoding = channel.metadata.get("topic_type_hash", ""), channel.message_encoding
+    if schema is None:
+        return Definition("", "", type_hash, "", encoding)
+    return Definition(schema.name, schema.data.decode("utf-8", "surrogateescape"), type_hash, schema.encoding, encoding)

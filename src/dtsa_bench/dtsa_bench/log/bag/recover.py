@@ -1,49 +1,57 @@
 """Makes a full bag of what a killed recorder, a full disk or a damaged file left behind.
 
-Whole chunks are copied from the start of the file to the first place that cannot be read; what lies behind it is given
-up, and named. Chunks of a flight end with complete slots, so what is saved is the flight up to the end of one. The
-original is only read.
+Whole records are copied from the start of the file. Where one cannot be read, copying goes on with the next chunk that
+can, and what lies between is named. Chunks of a flight end with complete slots, so what is saved up to the first
+damaged place is the flight up to the end of one. Messages stay as they are encoded; the original is only read.
 """
 
 from __future__ import annotations
 
+import mmap
+import re
 import struct
-from collections.abc import Iterator
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
+from zstandard import ZstdError
 
 from . import metadata
 from .errors import UnusableBag
-from .place import bag_of, find_file
-from .reader import MAGIC, PACKED_MESSAGES, PREFIX
+from .reader import MAGIC, PREFIX, definition_of, read_index
 from .schema import Definition
 from .writer import BROKEN_OFF, KEY, BagWriter
 
 _KINDS: dict[int, Any] = {
-    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK: Chunk, Opcode.METADATA: Metadata,
+    Opcode.HEADER: Header, Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK: Chunk,
+    Opcode.METADATA: Metadata,
 }  # fmt: skip
+MOST_TRIED = 64  # times the size of a file: bytes of what looks like chunks that are tried
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of the entries that follow
+# A chunk up to its compressed records: length, below 2^40; times, size, checksum; compression; length of the records.
+_CHUNK = re.compile(rb"\x06(.{5}\0{3}).{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)(.{8})", re.DOTALL)
 
 
 @dataclass(slots=True)
 class Recovery:
     """What was found in a damaged bag, and what was saved of it."""
 
-    source: Path
+    source: Path  # its first file
     directory: Path  # the new bag
     saved: dict[str, int] = field(default_factory=dict)  # messages by topic
     expected: dict[str, int] = field(default_factory=dict)  # by topic, where the old index still says it
     start_ns: int = 0
     end_ns: int = 0
+    whole_ns: int = 0  # log time up to which nothing is missing
     damaged: list[str] = field(default_factory=list)  # what is wrong, in words
     closed: bool = False  # whether the recorder finished the old file, and all of it could be read
 
@@ -53,53 +61,8 @@ class Recovery:
         return sum(self.saved.values())
 
 
-class _WholeRecords:
-    """The records of a file in their order, up to the first that is damaged; a chunk's stand in its place."""
-
-    def __init__(self, stream: IO[bytes], size: int) -> None:
-        self._stream, self._size = stream, size
-        self.fault = ""  # where and why the file cannot be read any further; empty: it was read to the end of its data
-
-    def __iter__(self) -> Iterator[Any]:
-        position, chunked = len(MAGIC), False
-        while True:
-            self._stream.seek(position)
-            try:
-                prefix = self._stream.read(PREFIX.size)
-                opcode, length = PREFIX.unpack(prefix)
-                begin = position + PREFIX.size
-                if length > self._size - begin:
-                    raise ValueError("it is cut off")
-                if opcode == Opcode.DATA_END and length == 4:
-                    return
-                if opcode == Opcode.MESSAGE and chunked:  # it has no checksum: as likely a damaged index
-                    raise ValueError("a message outside of chunks")
-                records = _parsed(opcode, self._stream.read(length))
-            except Exception as error:  # the library meets damage with many kinds of errors
-                lost = self._size - position
-                self.fault = f"what stands at byte {position} cannot be read ({error}): {lost} bytes are left out"
-                return
-            yield from records
-            position, chunked = begin + length, chunked or opcode == Opcode.CHUNK
-
-
-def _parsed(opcode: int, content: bytes) -> list[Any]:
-    """One record as the library's objects, a chunk as those in it; raises errors of any kind for a damaged one."""
-    if opcode in (Opcode.HEADER, Opcode.ATTACHMENT):
-        return []
-    if opcode == Opcode.MESSAGE_INDEX and _INDEX.unpack_from(content)[1] == len(content) - _INDEX.size:
-        return []
-    stream = ReadDataStream(BytesIO(content))
-    if opcode == Opcode.MESSAGE:
-        return [Message.read(stream, len(content))]
-    if opcode not in _KINDS:
-        raise ValueError(f"opcode {opcode} is out of place")
-    record = _KINDS[opcode].read(stream)
-    return breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
-
-
 def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
-    """Saves all messages of a bag up to its first damaged place to a new one.
+    """Save all messages of a damaged bag that can be read to a new one.
 
     :param path: the damaged bag: run directory, bag directory or .mcap file. It is only read.
     :param directory: where the new bag is made; None: beside the old one, with `_recovered` appended to
@@ -107,94 +70,187 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
     :raises ConfigError: if the new directory is in use, or nothing at all can be read.
     :raises BagError: if the new bag cannot be written.
     """
-    source, whole = find_file(path), bag_of(path).resolve()
-    beside = whole.with_name(f"{whole.name if whole.is_dir() else whole.stem}_recovered")
-    result = Recovery(source, beside if directory is None else Path(directory))
-    try:
-        stream = source.open("rb")
-    except OSError as error:
-        raise UnusableBag(path, f"cannot be read: {error.strerror or error}") from None
-    with stream:
-        if stream.read(len(MAGIC)) != MAGIC:
-            raise UnusableBag(path, f"{source.name} is not an MCAP file, or its beginning is lost")
-        result.expected = _indexed_counts(stream)
-        records = _WholeRecords(stream, source.stat().st_size)
-        about = _about(records, path)
-        result.closed = _copy(records, about, result)
-    expected = sum(result.expected.values())
-    if records.fault:
-        result.damaged.append(records.fault)
-    if not expected:
-        result.damaged.append("the recorder did not close the file")
-    elif expected > result.count:
-        result.damaged.append(f"{expected - result.count} of the {expected} messages that the file had are lost")
+    paths, bag = metadata.find_files(path), metadata.bag_of(path).resolve()
+    beside = bag.with_name(f"{bag.name if bag.is_dir() else bag.name.partition('.mcap')[0]}_recovered")
+    result = Recovery(paths[0], beside if directory is None else Path(directory))
+    with ExitStack() as stack:
+        files = [_DamagedFile(part, path, stack) for part in paths]
+        profile, about = _begin(files, path)
+        custom_data = {**metadata.custom_data(about), metadata.RECOVERED_FROM: result.source.name}
+        with BagWriter(result.directory, None, custom_data=custom_data, min_time_ns=0, profile=profile) as writer:
+            copy = _Copy(writer, metadata.has_packed_messages(about))
+            for file in files:
+                copy.add(file)
+            result.saved, result.expected = writer.counts, dict(copy.expected)
+            result.start_ns, result.end_ns = writer.time_range_ns
+            result.whole_ns = min(result.end_ns, *(file.whole_ns for file in files))
+            expected = sum(result.expected.values())
+            result.closed = 0 < expected <= result.count and all(file.counts for file in files)
+            if not result.closed:
+                writer.custom_data[BROKEN_OFF] = str(result.whole_ns)
+    for file in files:
+        result.damaged += file.faults
+        if not file.counts:
+            result.damaged.append(f"{file.path.name} was not closed, or its index is damaged")
+    result.damaged += [f"{count} {what}" for what, count in copy.lost.items()]
+    if expected > result.count:
+        result.damaged.append(f"{expected - result.count} of the {expected} messages that the bag had are lost")
     return result
 
 
-def _indexed_counts(stream: IO[bytes]) -> dict[str, int]:
-    """Messages by topic as the file's own index has them; empty if there is none."""
-    counts: dict[str, int] = {}
-    with suppress(Exception):  # of a damaged file: whatever the library meets, there is no index then
-        stream.seek(0)
-        summary = SeekingReader(stream).get_summary()
-        if summary is not None and summary.statistics is not None:
-            for identifier, channel in summary.channels.items():
-                count = summary.statistics.channel_message_counts.get(identifier, 0)
-                counts[channel.topic] = counts.get(channel.topic, 0) + count
-    return counts
-
-
-def _about(records: _WholeRecords, given: str | Path) -> dict[str, Any]:
-    """What the recorder says of the bag before its first message.
+def _begin(files: list[_DamagedFile], given: str | Path) -> tuple[str, dict[str, Any]]:
+    """MCAP's profile, and what the recorder says of the bag before its first message.
 
     :raises UnusableBag: if there is no message that can be read.
     """
-    about: dict[str, Any] = {}
-    for record in records:
-        if isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
-            about = metadata.load(record.metadata.get(metadata.RECORD_KEY, ""))
-            if metadata.has_packed_messages(about):
-                raise UnusableBag(given, PACKED_MESSAGES)
-        if isinstance(record, Message):
-            return about
+    profile, about = "", metadata.read_beside(files[0].path, given)
+    for file in files:
+        about, channels = {**about, **file.about}, set(file.summary.channels)
+        for record in file.records():
+            if isinstance(record, Header):
+                profile = record.profile
+            elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
+                about = {**about, **metadata.load_record(record)}
+            elif isinstance(record, Channel):
+                channels.add(record.id)
+            elif isinstance(record, Message) and record.channel_id in channels:
+                return profile, about
     raise UnusableBag(given, "no message in it can be read: there is nothing to save")
 
 
-def _copy(records: _WholeRecords, about: dict[str, Any], result: Recovery) -> bool:
-    """Writes the new bag; whether the old file was finished and could be read to its end."""
-    custom_data = {**metadata.custom_data(about), metadata.RECOVERED_FROM: result.source.name}
-    distro = str(about.get("ros_distro") or "jazzy")
-    schemas: dict[int, Schema] = {}
-    topics: dict[str, int] = {}
-    targets: dict[int, int] = {}  # channels of the new bag by those of the old one
-    unknown = 0
-    with BagWriter(result.directory, None, custom_data=custom_data, ros_distro=distro, min_time_ns=0) as writer:
-        for record in records:
+class _DamagedFile:
+    """One file of a bag, readable or not; open as long as the stack."""
+
+    def __init__(self, path: Path, given: str | Path, stack: ExitStack) -> None:
+        self.path = path
+        self.faults: list[str] = []  # where and why it cannot be read
+        self.whole_ns = 1 << 63  # log time of the last message before the first of them
+        self.summary = Summary()  # as the file's own index has it; empty if there is none
+        self.counts: dict[int, int] = {}  # messages by channel, likewise
+        self.about: dict[str, Any] = {}  # what the recorder says of the bag, likewise
+        self._tried = 0  # bytes of what looked like chunks
+        stream = stack.enter_context(metadata.open_file(path))
+        if stream.read(len(MAGIC)) != MAGIC:
+            raise UnusableBag(given, f"{path.name} is not an MCAP file, or its beginning is lost")
+        self._data = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+        with suppress(Exception):  # of a damaged file: whatever the library meets, there is no index then
+            reader, summary = read_index(stream)
+            self.summary = summary or self.summary
+            self.counts = self.summary.statistics.channel_message_counts if self.summary.statistics else {}
+            for record in reader.iter_metadata():
+                if record.name == metadata.RECORD_NAME:
+                    self.about = metadata.load_record(record)
+
+    def records(self) -> Iterator[Any]:
+        """The records that can be read, in their order; a chunk's stand in its place."""
+        self.faults, self.whole_ns = [], 1 << 63
+        position, size, last_ns = len(MAGIC), len(self._data), 0
+        chunked = self._next_chunk(position) < size
+        while position < size:
+            try:
+                begin = position + PREFIX.size
+                opcode, length = PREFIX.unpack(self._data[position:begin].ljust(PREFIX.size, b"\xff"))
+                if length > size - begin:
+                    raise ValueError("it is cut off")
+                if opcode == Opcode.DATA_END and length == 4:
+                    return
+                if opcode == Opcode.MESSAGE and chunked:  # it has no checksum: as likely a damaged index
+                    raise ValueError("a message outside of chunks")
+                records = _parsed(opcode, self._data[begin : begin + length])
+            except Exception as error:  # the library meets damage with many kinds of errors
+                goes_on = self._next_chunk(position + 1)
+                time = f", after {last_ns / 1e9:.3f} s," if last_ns else ""
+                self.faults.append(f"bytes {position} to {goes_on}{time} cannot be read ({error}) and are left out")
+                self.whole_ns, position = min(self.whole_ns, last_ns), goes_on
+                continue
+            yield from records
+            last_ns = max((record.log_time for record in records if isinstance(record, Message)), default=last_ns)
+            position = begin + length
+
+    def _next_chunk(self, position: int) -> int:
+        """Where the next whole chunk begins; the end of the file if there is none."""
+        while match := _CHUNK.search(self._data, position):
+            position, end = match.start(), match.start() + PREFIX.size + int.from_bytes(match[1], "little")
+            if match.end() + int.from_bytes(match[2], "little") == end <= len(self._data):
+                self._tried += end - position
+                if self._tried > MOST_TRIED * len(self._data):  # made so: chance has no such chunks within chunks
+                    break
+                with suppress(Exception):  # whatever the library meets: then it is none
+                    _parsed(Opcode.CHUNK, self._data[position + PREFIX.size : end])
+                    return position
+            position += 1
+        return len(self._data)
+
+
+def _parsed(opcode: int, content: bytes) -> list[Any]:
+    """One record as the library's objects, a chunk as those in it; raises errors of any kind for a damaged one."""
+    if opcode == Opcode.ATTACHMENT or (
+        opcode == Opcode.MESSAGE_INDEX and _INDEX.unpack_from(content)[1] == len(content) - _INDEX.size
+    ):
+        return []
+    stream = ReadDataStream(BytesIO(content))
+    if opcode == Opcode.MESSAGE:
+        return [Message.read(stream, len(content))]
+    if opcode not in _KINDS:
+        raise ValueError(f"opcode {opcode} is out of place")
+    record = _KINDS[opcode].read(stream)
+    if stream.count != len(content):
+        raise ValueError("its length is wrong")
+    return breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+
+
+class _Copy:
+    """What is copied to a new bag; `packed`: messages are compressed one by one, and are unpacked."""
+
+    def __init__(self, writer: BagWriter, packed: bool) -> None:
+        self._writer, self._unpack = writer, metadata.unpack_message if packed else bytes
+        self._topics: dict[str, tuple[int, Definition]] = {}  # channel of the new bag, what it is
+        self.lost: Counter[str] = Counter()  # by why it is lost
+        self.expected: Counter[str] = Counter()  # messages by topic, as the files' own indexes say
+
+    def add(self, file: _DamagedFile) -> None:
+        """Copy what can be read of one file."""
+        schemas, channels = dict(file.summary.schemas), dict(file.summary.channels)
+        targets: dict[int, int] = {}  # channels of the new bag by those of the file; 0: none
+        for record in file.records():
             if isinstance(record, Message):
-                if record.channel_id not in targets:
-                    unknown += 1
-                    continue
-                target = targets[record.channel_id]
-                writer.write(target, record.data, record.log_time, record.publish_time, record.sequence)
+                if record.channel_id not in targets:  # its channel stands where the file is damaged
+                    targets[record.channel_id] = self._channel(channels.get(record.channel_id), schemas)
+                self._write(targets[record.channel_id], record)
             elif isinstance(record, Schema):
                 schemas[record.id] = record
-            elif isinstance(record, Channel) and record.schema_id in schemas:
-                if record.topic not in topics:
-                    schema = schemas[record.schema_id]
-                    text, type_hash = schema.data.decode("utf-8", "replace"), record.metadata.get("topic_type_hash", "")
-                    profiles = metadata.load_profiles(record.metadata.get("offered_qos_profiles", ""))
-                    definition = Definition(schema.name, text, type_hash)
-                    topics[record.topic] = writer.add_topic(record.topic, schema.name, profiles, definition)
-                targets[record.id] = topics[record.topic]
-            elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
-                last = metadata.custom_data(metadata.load(record.metadata.get(metadata.RECORD_KEY, "")))
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+                targets[record.id] = self._channel(record, schemas)
+            elif isinstance(record, Metadata) and record.name != metadata.RECORD_NAME:
+                self._writer.add_metadata(record.name, record.metadata)
+            elif isinstance(record, Metadata):
+                last = metadata.custom_data(metadata.load_record(record))
                 if KEY in last:  # the new bag gets a digest of its own
-                    writer.custom_data[f"recovered_{KEY}"] = last[KEY]
-        result.saved = writer.counts
-        result.start_ns, result.end_ns = writer.time_range_ns
-        whole = not records.fault and bool(result.expected)
-        if not whole:
-            writer.custom_data[BROKEN_OFF] = str(result.end_ns)
-    if unknown:
-        result.damaged.append(f"{unknown} messages belong to topics that are not defined")
-    return whole
+                    self._writer.custom_data[f"recovered_{KEY}"] = last[KEY]
+        for number, count in file.counts.items():
+            self.expected[channels[number].topic if number in channels else "?"] += count
+
+    def _write(self, channel: int, record: Message) -> None:
+        try:
+            data = self._unpack(record.data)
+        except (ZstdError, MemoryError):
+            self.lost["messages cannot be unpacked"] += 1
+            return
+        if channel:
+            self._writer.write(channel, data, record.log_time, record.publish_time, record.sequence)
+        else:
+            self.lost["messages belong to topics that are not defined"] += 1
+
+    def _channel(self, channel: Channel | None, schemas: Mapping[int, Schema]) -> int:
+        """The new bag's channel for one of the file; 0: it is not defined, or its topic has another type already."""
+        if channel is None or (channel.schema_id and channel.schema_id not in schemas):
+            return 0
+        definition = definition_of(channel, schemas.get(channel.schema_id))
+        if channel.topic not in self._topics:
+            profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
+            number = self._writer.add_topic(channel.topic, definition.name, profiles, definition)
+            self._topics[channel.topic] = number, definition
+        number, first = self._topics[channel.topic]
+        kind = (definition.name, definition.encoding, definition.message_encoding)
+        return number if kind == (first.name, first.encoding, first.message_encoding) else 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.wire.cdr import SECOND
@@ -18,26 +18,16 @@ from .errors import BagError
 from .metadata import PROFILES, Profile
 from .reader import Bag, Message, Topic
 
-SPIN_NS = 150_000  # ns, the last part of each wait is waited out awake: sleeping is not exact enough
+CLOCK = "/clock"
 CLOCK_NS = 10_000_000  # ns of wall time, longest time without a /clock message
 POLL_NS = 20_000_000  # ns of wall time between two calls of `poll`
-
-
-class Output(Protocol):
-    """Where a player's messages go."""
-
-    def publish(self, message: Message) -> None:
-        """Publish one recorded message now."""
-
-    def clock(self, time_ns: int) -> None:
-        """Publish the simulated time now."""
+MAX_DEPTH = 1000  # messages that a publisher keeps for late subscribers at most
 
 
 class Player:
     """Plays one bag to one output.
 
-    :param bag: open bag; used by this player alone while it plays.
-    :param output: takes the messages.
+    :param output: takes the messages and the time: a `RosOutput`, or what has its `publish` and `clock`.
     :param rate: simulated seconds in one second of wall time, above 0.
     :param start_s: s from the bag's start, where to begin.
     :param loop: begin again at the end.
@@ -49,7 +39,7 @@ class Player:
     def __init__(
         self,
         bag: Bag,
-        output: Output,
+        output: Any,
         rate: float = 1.0,
         start_s: float = 0.0,
         loop: bool = False,
@@ -96,7 +86,7 @@ class Player:
         self._next_clock_ns = time.monotonic_ns() + CLOCK_NS
 
     def _wait(self, time_ns: int, poll: Callable[[Player], None] | None) -> None:
-        """Waits until a simulated time is due; `/clock` and `poll` go on meanwhile."""
+        """Wait until a simulated time is due; `/clock` and `poll` go on meanwhile."""
         while not self.stopped:
             now = time.monotonic_ns()
             if poll is not None and now >= self._next_poll_ns:
@@ -110,39 +100,56 @@ class Player:
             left_ns = self._begin_ns + int((time_ns - self._from_ns) / self._rate) - now
             if left_ns <= 0:
                 return
-            if left_ns > SPIN_NS:
-                time.sleep(min(left_ns - SPIN_NS, max(self._next_clock_ns - now, SPIN_NS)) / 1e9)
-                passed_ns = time.monotonic_ns() - now
-                if now + passed_ns >= self._next_clock_ns and passed_ns < left_ns - SPIN_NS:
-                    self._publish_clock(time_ns - int((left_ns - passed_ns) * self._rate))
+            if now >= self._next_clock_ns:
+                self._publish_clock(time_ns - int(left_ns * self._rate))
+            time.sleep(min(left_ns, CLOCK_NS) / 1e9)
 
 
 class RosOutput:
-    """Publishes on the ROS graph with the recorded QoS.
+    """Publishes on the ROS graph with the recorded QoS. A recorded `/clock` replaces the player's.
 
     :param node: rclpy node that owns the publishers.
-    :param topics: the topics to play.
-    :raises BagError: if a message type is not installed, or is another than the recorded one.
+    :param topics: the topics to play; those whose type is not installed are left out.
+    :param warn: called with a line for each of them.
+    :raises ConfigError: if ROS 2 forbids the name of a topic.
+    :raises BagError: if a message type is another than the recorded one, or no topic can be played.
     """
 
-    def __init__(self, node: Any, topics: Collection[Topic]) -> None:
+    def __init__(self, node: Any, topics: Collection[Topic], warn: Callable[[str], None]) -> None:
+        from rclpy.exceptions import NameValidationException
         from rosgraph_msgs.msg import Clock
 
         self._publishers: dict[str, Any] = {}
         for topic in topics:
-            installed = schema.installed(topic.type)
+            try:
+                if not topic.encoding.startswith("cdr/"):
+                    raise BagError(f"recorded as {topic.encoding}, not as cdr")
+                installed = schema.installed(topic.type)
+                package, _, name = topic.type.split("/")
+                kind = getattr(import_module(f"{package}.msg"), name)
+            except (BagError, ImportError, AttributeError) as error:
+                warn(f"{topic.name} is left out: {error}")
+                continue
             if topic.type_hash and topic.type_hash != installed.type_hash:
                 raise BagError(
                     f"{topic.name}: the bag's {topic.type} differs from the installed one "
                     f"({topic.type_hash} / {installed.type_hash}); leave it out with --topics"
                 )
-            package, _, name = topic.type.split("/")
-            kind = getattr(import_module(f"{package}.msg"), name)
-            self._publishers[topic.name] = node.create_publisher(kind, topic.name, ros_profile(topic.profiles))
-        self._clock, self._time = (
-            node.create_publisher(Clock, "/clock", ros_profile([PROFILES["best_effort"]])),
-            Clock(),
-        )
+            try:
+                profile = ros_profile(topic.profiles, topic.count)
+                self._publishers[topic.name] = node.create_publisher(kind, topic.name, profile)
+            except NameValidationException:
+                allowed = "a name of ROS 2: letters, digits, _ and / alone; leave it out with --topics"
+                raise ConfigError("topic", topic.name, allowed) from None
+        if not self._publishers:
+            raise BagError("none of the topics can be played")
+        self._time, best_effort = Clock(), ros_profile([PROFILES["best_effort"]])
+        self._clock = None if CLOCK in self._publishers else node.create_publisher(Clock, CLOCK, best_effort)
+
+    @property
+    def topics(self) -> list[str]:
+        """Names of the topics that can be played."""
+        return list(self._publishers)
 
     def subscribers(self) -> int:
         """Subscriptions to the recorded topics that have been found so far."""
@@ -153,21 +160,33 @@ class RosOutput:
         self._publishers[message.topic].publish(message.data)
 
     def clock(self, time_ns: int) -> None:
-        """Publish `/clock`."""
-        self._time.clock.sec, self._time.clock.nanosec = divmod(time_ns, SECOND)
-        self._clock.publish(self._time)
+        """Publish `/clock`, unless it is recorded."""
+        if self._clock is not None:
+            self._time.clock.sec, self._time.clock.nanosec = divmod(time_ns, SECOND)
+            self._clock.publish(self._time)
 
 
-def ros_profile(profiles: Collection[Profile]) -> Any:
-    """rclpy's QoSProfile for recorded profiles: what every one of them offers; none: the default profile."""
+def ros_profile(profiles: Collection[Profile], count: int = 0) -> Any:
+    """rclpy's QoSProfile of one publisher in place of those that were recorded.
+
+    It is reliable if all of them were, and keeps messages for late subscribers if one of them did: as many as they did
+    together, or all `count` of the topic where the recording does not know how many that were, as the middleware does
+    not tell a recorder.
+    """
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
     reliable = all(entry.get("reliability") != "best_effort" for entry in profiles)
-    latched = bool(profiles) and all(entry.get("durability") == "transient_local" for entry in profiles)
-    depth = max((int(entry.get("depth", 10)) for entry in profiles), default=10)
+    latched = [entry for entry in profiles if entry.get("durability") == "transient_local"]
+    depths = [
+        depth if entry.get("history") == "keep_last" and isinstance(depth := entry.get("depth"), int) else 0
+        for entry in latched or profiles
+    ]
+    depth = max(depths, default=0) or 10
+    if latched:
+        depth = sum(depths) if min(depths) > 0 else count
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=max(1, depth),
+        depth=min(max(1, depth), MAX_DEPTH),
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

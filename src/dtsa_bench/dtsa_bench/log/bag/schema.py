@@ -1,9 +1,8 @@
 """Message definitions and type hashes for the schemas of a bag.
 
-The texts are the original `.msg` files from the ament index: the Python messages of Jazzy do not carry
-them, and a regenerated text would lose comments and defaults. Where there is no ROS, the project's own
-`.msg` files are those that the distribution `dtsa` brings along (`messages`), and rosbags makes the texts of
-those of ROS. The hashes are the same.
+The texts are the original `.msg` files from the ament index: the Python messages of Jazzy do not carry them, and a
+regenerated text would lose comments and defaults. Where there is no ROS, the project's own `.msg` files are those that
+the distribution `dtsa` brings along (`messages`), and rosbags makes the texts of those of ROS. The hashes are the same.
 """
 
 from __future__ import annotations
@@ -20,50 +19,27 @@ from .errors import BagError
 
 _BROUGHT = Path(__file__).resolve().parent / "messages"  # those of dtsa_msgs, where there is no ROS
 SEPARATOR = "=" * 80
-PRIMITIVES = frozenset(
-    [
-        "bool",
-        "byte",
-        "char",
-        "float32",
-        "float64",
-        "int8",
-        "uint8",
-        "int16",
-        "uint16",
-        "int32",
-        "uint32",
-        "int64",
-        "uint64",
-        "string",
-        "wstring",
-    ]
-)
-_FIELD = re.compile(r"^\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]\w*\s*(?!\s*=)")
-_CONSTANT = re.compile(r"^\s*[A-Za-z][\w/]*(?:<=\d+)?\s+[A-Z]\w*\s*=")
+_PRIMITIVE = re.compile(r"bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string")
+_FIELD = re.compile(r"\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]")  # or a constant, of a primitive type
+_MESSAGE_TYPE = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*")
 
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """What a bag stores about a message type."""
+    """What a bag stores about a type of messages."""
 
     name: str  # "package/msg/Type"
     text: str  # root definition and, after a separator each, all definitions that it needs
     type_hash: str  # "RIHS01_..."
+    encoding: str = "ros2msg"  # of the definition
+    message_encoding: str = "cdr"
 
 
-def dependencies(text: str, package: str) -> list[str]:
-    """Message types that a definition names, in order of appearance, once each."""
-    found: dict[str, None] = {}
-    for line in text.splitlines():
-        line = line.split("#", 1)[0]
-        match = _FIELD.match(line)
-        if not match or _CONSTANT.match(line) or match[1] in PRIMITIVES:
-            continue
-        parts = match[1].split("/")
-        owner = parts[0] if len(parts) > 1 else package
-        found[f"{owner}/msg/{parts[-1]}"] = None
-    return list(found)
+def _dependencies(text: str, package: str) -> list[str]:
+    """Types of messages that a definition names, in order of appearance."""
+    names = (match[1] for line in text.splitlines() if (match := _FIELD.match(line)))
+    types = (name.rpartition("/") for name in names if not _PRIMITIVE.fullmatch(name))
+    return [f"{owner.partition('/')[0] or package}/msg/{short}" for owner, _, short in types]
 
 
 def concatenate(name: str, text_of: Callable[[str], str]) -> str:
@@ -71,47 +47,42 @@ def concatenate(name: str, text_of: Callable[[str], str]) -> str:
 
     :param text_of: gives the text of one `.msg` file by its type's full name.
     """
-    root = text_of(name)
-    parts = [root]
-    seen = {name}
-    waiting = dependencies(root, name.split("/")[0])
+    texts: dict[str, str] = {}
+    waiting = [name]
     while waiting:
-        dependency = waiting.pop(0)
-        if dependency in seen:
-            continue
-        seen.add(dependency)
-        text = text_of(dependency)
-        package, _, short = dependency.split("/")
-        parts.append(f"{SEPARATOR}\nMSG: {package}/{short}\n{text}")
-        waiting.extend(dependencies(text, package))
-    return "\n".join(parts)
+        kind = waiting.pop(0)
+        if kind not in texts:
+            texts[kind] = text_of(kind)
+            waiting += _dependencies(texts[kind], kind.split("/")[0])
+    root = texts.pop(name)
+    return "\n".join([root, *(f"{SEPARATOR}\nMSG: {kind.replace('/msg', '')}\n{text}" for kind, text in texts.items())])
 
 
 @cache
 def installed(name: str) -> Definition:
-    """Definition and RIHS01 hash of an installed message type.
+    """Definition and RIHS01 hash of an installed type of messages.
 
-    :raises BagError: if the package or its type description is not installed.
+    :raises BagError: if it is not installed, or is no type of messages.
     """
+    if not _MESSAGE_TYPE.fullmatch(name):
+        raise BagError(f"message type {name!r}: not of the form package/msg/Type")
     if importlib.util.find_spec("ament_index_python") is None and _BROUGHT.is_dir():
         return brought(name, _BROUGHT)
-    description = _file(name, ".json")
-    hashes = json.loads(description.read_text(encoding="utf-8"))["type_hashes"]
-    type_hash = next((entry["hash_string"] for entry in hashes if entry["type_name"] == name), None)
-    if type_hash is None:
-        raise BagError(f"message type {name}: {description} holds no hash of it")
-    text = concatenate(name, lambda kind: _file(kind, ".msg").read_text(encoding="utf-8"))
-    return Definition(name, text, type_hash)
+    hashes = json.loads(_file(name, ".json").read_text(encoding="utf-8"))["type_hashes"]
+    type_hash = next(entry["hash_string"] for entry in hashes if entry["type_name"] == name)
+    return Definition(name, concatenate(name, lambda kind: _file(kind, ".msg").read_text(encoding="utf-8")), type_hash)
 
 
 def brought(name: str, folder: Path) -> Definition:
-    """Definition and RIHS01 hash of a message type where there is no ROS."""
+    """Definition and RIHS01 hash of a type of messages where there is no ROS; `folder`: the project's own files."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     own = {f"dtsa_msgs/msg/{path.stem}": path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.msg"))}
     store = get_typestore(Stores.ROS2_JAZZY)
     for kind, text in own.items():
         store.register(get_types_from_msg(text, kind))
+    if name not in store.fielddefs:
+        raise BagError(f"message type {name}: not installed")
 
     def text_of(kind: str) -> str:
         return own[kind] if kind in own else store.generate_msgdef(kind, ros_version=2)[0].partition(SEPARATOR)[0]

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 from time import monotonic
-from types import TracebackType
 from typing import Any, NoReturn
 
 from mcap.writer import CompressionType, Writer
@@ -26,18 +26,31 @@ from dtsa_agent.ros.common.wire.packing import RUN_MESSAGES, without_run
 from dtsa_bench import __version__
 from dtsa_bench.runs.program import program
 
-from . import metadata, schema
+from . import metadata
 from .errors import BagError
-from .metadata import Profile
+from .schema import Definition, installed
 
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
 FLUSH_S = 0.5
-BROKEN_OFF = "broken_off"  # key of custom_data of a bag saved from a file that was not finished: its end, ns
-MARKED = "chunks"  # key of custom_data of a bag whose chunks end where a step of the run is complete,
-COMPLETE = "complete steps"  # and its value
+BROKEN_OFF = "broken_off"  # key of custom_data of a bag of which a part is lost: log time up to which it is whole, ns
+KEY = "digest"  # name of the digest in custom_data
 _UNLIMITED = 1 << 62  # bytes: chunks end at marks
 _RECORD_BYTES = 31  # bytes of a message record beside its data
+_TIMES = struct.Struct("<QQQ")
+_MASK = (1 << 128) - 1
+
+
+@dataclass(slots=True)
+class _Channel:
+    """A topic that is recorded."""
+
+    topic: str
+    key: bytes  # its name, as the digest takes it
+    definition: Definition
+    profiles: Sequence[metadata.Profile]
+    has_run: bool  # its messages carry the run's id
+    count: int = 0  # messages written
 
 
 class BagWriter:
@@ -49,9 +62,9 @@ class BagWriter:
     :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
     :param chunk_size: bytes, size at which a chunk is closed even if its half second is not over.
     :param custom_data: further texts for `custom_data` of the metadata.
-    :param ros_distro: ROS distribution named in the metadata.
     :param min_time_ns: ns, earliest log time that is accepted.
-    :param marked: whether chunks end at a `mark` only; who records calls it after each step of the run.
+    :param marked: whether chunks end at a `mark` only; the recorder calls it after each step of the run.
+    :param profile: MCAP's name for the conventions that topics and messages follow.
     :raises ConfigError: if the directory is in use or the compression is unknown.
     :raises BagError: if the directory cannot be made or written to.
     """
@@ -63,9 +76,9 @@ class BagWriter:
         compression: str = "zstd",
         chunk_size: int = 1 << 20,
         custom_data: Mapping[str, str] | None = None,
-        ros_distro: str = "jazzy",
         min_time_ns: int = MIN_TIME_NS,
         marked: bool = False,
+        profile: str = "ros2",
     ) -> None:
         if compression not in COMPRESSIONS:
             raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
@@ -81,20 +94,14 @@ class BagWriter:
                 "configuration": json.dumps(config, sort_keys=True),
             }
         if marked:
-            self.custom_data[MARKED] = COMPLETE
-        self._marked, self._chunk_size = marked, chunk_size
+            self.custom_data["chunks"] = "complete steps"
+        self._marked, self._chunk_size, self._min_time_ns = marked, chunk_size, min_time_ns
         self._chunk_bytes = 0  # in the chunk that is being filled
-        self._min_time_ns = min_time_ns
         self.path = self.directory / f"{self.directory.resolve().name}_0.mcap"
-        self._ros_distro = ros_distro
-        self._topics: dict[str, tuple[int, schema.Definition, list[Profile]]] = {}
-        self._schemas: dict[str, int] = {}
-        self._counts = [0]  # messages by channel id; ids start at 1
-        self._names = [b""]  # topics by channel id
-        self._runs = [False]  # by channel id: whether its messages carry the run's id
+        self._channels: list[_Channel] = []  # the channel's number - 1 is its index
+        self._schemas: dict[Definition, int] = {}
         self._digest = BagDigest()
-        self._start_ns = 1 << 63
-        self._end_ns = 0
+        self._start_ns, self._end_ns = 1 << 63, 0
         self._unsaved = 0  # messages since the last flush
         self._failure = ""
         self._closed = False
@@ -105,64 +112,60 @@ class BagWriter:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         size = _UNLIMITED if marked else chunk_size
         self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
-        try:
-            self._mcap.start(profile="ros2", library=f"dtsa {__version__}")
-            self._add_metadata_record()
+        with self._failing():
+            self._mcap.start(profile=profile, library=f"dtsa {__version__}")
+            self._add_own_metadata()
             self._stream.flush()
-        except OSError as error:
-            self._fail(error)
         self._next_flush = monotonic() + FLUSH_S
 
     @property
     def message_count(self) -> int:
         """Messages written so far."""
-        return sum(self._counts)
+        return sum(channel.count for channel in self._channels)
 
     @property
     def counts(self) -> dict[str, int]:
         """Messages written so far, by topic."""
-        return {name: self._counts[entry[0]] for name, entry in self._topics.items()}
+        return {channel.topic: channel.count for channel in self._channels}
 
     @property
     def time_range_ns(self) -> tuple[int, int]:
         """Log times of the earliest and the latest message, ns; zeros in an empty bag."""
-        return (self._start_ns, self._end_ns) if self.message_count else (0, 0)
+        return (self._start_ns, self._end_ns) if self._start_ns <= self._end_ns else (0, 0)
 
     def add_topic(
         self,
         topic: str,
         type_name: str,
-        qos: str | Profile | Sequence[Profile] = "reliable",
-        definition: schema.Definition | None = None,
+        qos: str | Sequence[metadata.Profile] = "reliable",
+        definition: Definition | None = None,
     ) -> int:
         """Announce a topic; may be done at any time before its first message.
 
         :param topic: full name, with its leading slash.
         :param type_name: "package/msg/Type".
-        :param qos: name from `metadata.PROFILES`, or the profile or profiles that its publishers offer.
+        :param qos: name from `metadata.PROFILES`, or the profiles that its publishers offer.
         :param definition: message definition and type hash; None: those of the installed type.
         :return: the channel for `write`.
         :raises ConfigError: if the topic is there already or the QoS name is unknown.
         :raises BagError: if the type is not installed.
         """
         self._check_open()
-        if topic in self._topics:
+        if any(channel.topic == topic for channel in self._channels):
             raise ConfigError("topic", topic, "a name that is not in the bag yet")
-        profiles = metadata.resolve_profiles(qos)
-        definition = definition or schema.installed(type_name)
-        if type_name not in self._schemas:
-            self._schemas[type_name] = self._mcap.register_schema(type_name, "ros2msg", definition.text.encode())
-        channel = self._mcap.register_channel(
-            topic,
-            "cdr",
-            self._schemas[type_name],
-            {"offered_qos_profiles": metadata.dump_profiles(profiles), "topic_type_hash": definition.type_hash},
-        )
-        self._topics[topic] = (channel, definition, profiles)
-        self._counts.append(0)
-        self._names.append(topic.encode())
-        self._runs.append(type_name in RUN_MESSAGES)
-        return channel
+        if isinstance(qos, str) and qos not in metadata.PROFILES:
+            raise ConfigError("qos", qos, ", ".join(metadata.PROFILES))
+        profiles = [metadata.PROFILES[qos]] if isinstance(qos, str) else list(qos)
+        definition = definition or installed(type_name)
+        schema = self._schemas.get(definition, 0)  # 0: a channel without one
+        if not schema and definition.encoding:
+            data = definition.text.encode("utf-8", "surrogateescape")
+            schema = self._schemas[definition] = self._mcap.register_schema(type_name, definition.encoding, data)
+        about = {"offered_qos_profiles": metadata.dump_profiles(profiles), "topic_type_hash": definition.type_hash}
+        number = self._mcap.register_channel(topic, definition.message_encoding, schema, about)
+        has_run = type_name in RUN_MESSAGES
+        self._channels.append(_Channel(topic, topic.encode("utf-8", "replace"), definition, profiles, has_run))
+        return number
 
     def write(
         self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int | None = None
@@ -180,17 +183,18 @@ class BagWriter:
             self._check_open()
         if log_time_ns < self._min_time_ns:
             raise BagError(f"message at {log_time_ns} ns: times of a bag start at {self._min_time_ns} ns")
-        if not 0 < channel < len(self._counts):
+        if not 0 < channel <= len(self._channels):
             raise BagError(f"channel {channel} was never added to {self.directory}")
+        target = self._channels[channel - 1]
         self._unsaved += 1
         if sequence is None:
-            sequence = self._counts[channel]
+            sequence = target.count
         try:
             self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
         except OSError as error:
             self._fail(error)
-        self._digest.add(self._names[channel], log_time_ns, publish_time_ns, sequence, data, self._runs[channel])
-        self._counts[channel] += 1
+        self._digest.add(target.key, log_time_ns, publish_time_ns, sequence, data, target.has_run)
+        target.count += 1
         if log_time_ns < self._start_ns:
             self._start_ns = log_time_ns
         if log_time_ns > self._end_ns:
@@ -199,6 +203,12 @@ class BagWriter:
             self._chunk_bytes += len(data) + _RECORD_BYTES
         elif monotonic() >= self._next_flush:
             self.flush()
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Store a metadata record of another name than rosbag2's; raises BagError if that fails."""
+        self.flush()  # such a record stands between chunks
+        with self._failing():
+            self._mcap.add_metadata(name, dict(values))
 
     def mark(self) -> None:
         """What has been written until now is a run up to a complete step: a chunk may end here.
@@ -217,10 +227,8 @@ class BagWriter:
         :raises BagError: if that fails, on a full disk for example.
         """
         self._check_open()
-        try:
+        with self._failing():
             self._mcap.flush()
-        except OSError as error:
-            self._fail(error)
         self._unsaved = self._chunk_bytes = 0
         self._next_flush = monotonic() + FLUSH_S
 
@@ -232,37 +240,59 @@ class BagWriter:
         if self._closed:
             return
         self._closed = True
-        if self._failure:  # told already, by the call that met it
+        if self._failure:  # the call that met it has reported it
             with suppress(OSError):
                 self._stream.close()
             return
         self.custom_data[KEY] = self._digest.hexdigest()
-        try:
+        with self._failing():
             self._mcap.flush()
-            self._add_metadata_record()
+            self._add_own_metadata()
             self._mcap.finish()
             self._stream.close()
             metadata.write(self.directory, self._metadata())
-        except OSError as error:
-            self._fail(error)
 
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *unused: object) -> None:
         self.close()
 
     def _metadata(self) -> dict[str, Any]:
+        """What `metadata.yaml` says below its root."""
+        start_ns, end_ns = self.time_range_ns
+        extent = {
+            "starting_time": {"nanoseconds_since_epoch": start_ns},
+            "duration": {"nanoseconds": end_ns - start_ns},
+            "message_count": self.message_count,
+        }
         topics = [
-            metadata.TopicSummary(name, definition.name, profiles, definition.type_hash, self._counts[channel])
-            for name, (channel, definition, profiles) in self._topics.items()
+            {
+                "topic_metadata": {
+                    "name": channel.topic,
+                    "type": channel.definition.name,
+                    "serialization_format": channel.definition.message_encoding,
+                    "offered_qos_profiles": channel.profiles,
+                    "type_description_hash": channel.definition.type_hash,
+                },
+                "message_count": channel.count,
+            }
+            for channel in self._channels
         ]
-        start_ns = self._start_ns if self.message_count else 0
-        return metadata.build(self.path.name, topics, start_ns, self._end_ns, self.custom_data, self._ros_distro)
+        return {
+            "version": metadata.VERSION,
+            "storage_identifier": "mcap",
+            **extent,
+            "topics_with_message_count": topics,
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [self.path.name],
+            "files": [{"path": self.path.name, **extent}],
+            "custom_data": self.custom_data,
+            "ros_distro": "jazzy",
+        }
 
-    def _add_metadata_record(self) -> None:
+    def _add_own_metadata(self) -> None:
         self._mcap.add_metadata(metadata.RECORD_NAME, {metadata.RECORD_KEY: metadata.dump(self._metadata())})
 
     def _check_open(self) -> None:
@@ -270,6 +300,13 @@ class BagWriter:
             raise BagError(self._failure)
         if self._closed:
             raise BagError(f"the bag {self.directory} is closed: nothing more can be recorded to it")
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._fail(error)
 
     def _fail(self, error: OSError) -> NoReturn:
         lost = f", up to {self._unsaved} messages are not saved" if self._unsaved else ""
@@ -280,12 +317,6 @@ class BagWriter:
         with suppress(OSError):
             self._stream.close()
         raise BagError(self._failure) from error
-
-
-KEY = "digest"  # name of the digest in a bag's custom data
-
-_TIMES = struct.Struct("<QQQ")
-_MASK = (1 << 128) - 1
 
 
 class BagDigest:
@@ -305,16 +336,12 @@ class BagDigest:
     def add(
         self, topic: bytes, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes, run: bool = False
     ) -> None:
-        """Take in one message.
-
-        :param data: its CDR bytes.
-        :param run: whether it carries a run's id.
-        """
+        """Take in one message; `run`: whether its bytes carry a run's id."""
         state = blake2b(topic, digest_size=16)
         state.update(_TIMES.pack(log_time_ns, publish_time_ns, sequence))
         state.update(without_run(data) if run else data)
         self._sum = (self._sum + int.from_bytes(state.digest(), "little")) & _MASK
 
     def hexdigest(self) -> str:
-        """The digest so far, 32 hexadecimal digits."""
+        """The digest so far."""
         return f"{self._sum:032x}"
