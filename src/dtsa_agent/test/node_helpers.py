@@ -136,11 +136,8 @@ def graph_in(domain: int, logs: Path) -> Iterator[Graph]:
 
 
 def _made(domain: int, name: str) -> Node:
-    """A node in a context of its own.
-
-    Without shared memory: to end it beside what was killed may crash the middleware.
-    """
-    limit_to_machine(os.environ, shared_memory=False)
+    """A node in a context of its own."""
+    limit_to_machine(os.environ)
     context = Context()
     init_ros([], context, domain)
     return Node(name, context=context, enable_rosout=False, start_parameter_services=False)

@@ -15,8 +15,7 @@ from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.namespaces import declare_swarm_namespace
 from dtsa_agent.ros.common.graph.parameters import declare_setting
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import node_options, run_node
-from dtsa_agent.ros.common.workarounds.kept_nodes import ending
+from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
 
 from .hosting import declare_swarm, host_agents
 

@@ -11,8 +11,7 @@ from dtsa_agent.core.settings.declaration import Setting
 from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.graph.parameters import declare_setting
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import node_options, run_node
-from dtsa_agent.ros.common.workarounds.kept_nodes import ending
+from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
 
 from .hosting import declare_swarm, host_agents
 from .swarm_node import parse_ids

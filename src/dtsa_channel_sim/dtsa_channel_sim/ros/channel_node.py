@@ -22,9 +22,8 @@ from dtsa_agent.ros.common.graph.names import MODES
 from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, from_parameter
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import run_node
+from dtsa_agent.ros.common.process.node_process import ending, run_node
 from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
-from dtsa_agent.ros.common.workarounds.kept_nodes import ending
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, ChannelConfig
 from dtsa_channel_sim.model.schedule import Change

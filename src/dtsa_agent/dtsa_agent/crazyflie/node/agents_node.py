@@ -158,7 +158,7 @@ def _body(stop: Stop, supervised: bool) -> None:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the node."""
-    return run_node("crazyflie_agents", _body, args, real_time=True)
+    return run_node("crazyflie_agents", _body, args)
 
 
 if __name__ == "__main__":

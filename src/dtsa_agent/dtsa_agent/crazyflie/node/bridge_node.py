@@ -261,7 +261,7 @@ def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = r
     """Entry point of the executable `crazyflie_bridge`; `use` returns the exit code."""
     argv = list(sys.argv if args is None else args)
     follow_supervisor()
-    limit_to_machine(os.environ, shared_memory=False)
+    limit_to_machine(os.environ)
     try:
         init_ros(argv)
     except Exception as error:  # rclpy's errors for a wrong command line have no common base

@@ -68,7 +68,7 @@ class GraphSource:
         self, history: RunHistory, domain: int | None = None, space: str = names.SWARM, control: bool = False
     ) -> None:
         self._history, self._space = history, space
-        limit_to_machine(os.environ, shared_memory=False)  # a process that is killed beside it does not block it
+        limit_to_machine(os.environ)
         self._context = Context()
         init_ros(None, self._context, domain)
         self._node = Node(
