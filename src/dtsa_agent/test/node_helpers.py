@@ -18,8 +18,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from waiting import wait_for
 
+from dtsa_agent.ros.common.process.loop import Serving
 from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.process.serving import Serving
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 from dtsa_bench.flights.domain import ros_domain
 

@@ -17,8 +17,7 @@ from dtsa_agent.core.settings.config import agreed_settings
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings, swarm_wide_node
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import ending, run_node
 from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
@@ -27,7 +26,7 @@ from dtsa_bench.drawing import optional_picture
 from dtsa_bench.runs.config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.options import new_directory
 from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig
-from dtsa_channel_sim.ros.answer_limits import AnswerLimits
+from dtsa_channel_sim.model.config import AnswerLimits
 from dtsa_channel_sim.ros.channel_node import follow_parameters, watch
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel

@@ -12,7 +12,7 @@ from rclpy.serialization import serialize_message
 from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
-from dtsa_agent.ros.common.wire.report_fields import ReportFields
+from dtsa_agent.ros.common.wire.messages import Fields
 from dtsa_bench.recordings.bag.cdr import CdrBuilder, OdometryPacker
 from dtsa_bench.recordings.bag.metadata import RUN_ID
 from dtsa_bench.recordings.bag.writer import BagWriter
@@ -85,7 +85,7 @@ class FlightRecorder(ChannelObserver):
     def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
         self._frames.setdefault(slot, []).append((data, time_ns))
 
-    def report(self, message: ReportFields, data: bytes) -> None:
+    def report(self, message: Fields, data: bytes) -> None:
         if len(message.slot):
             at = self._time_ns(int(message.slot[-1]))
             self.bag.write(self._report, data, at, at)

@@ -16,8 +16,8 @@ from visualization_msgs.msg import MarkerArray
 from dtsa_agent.core import REASONS, Scenario
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.cdr import Message
+from dtsa_agent.ros.common.wire.messages import header_of
 from dtsa_agent.ros.common.wire.packing import pack_received
-from dtsa_agent.ros.common.wire.stamps import header_of
 from dtsa_bench.recordings.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPacker
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
 from dtsa_channel_sim.ros.answers import Answers

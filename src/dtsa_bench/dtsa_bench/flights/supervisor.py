@@ -13,9 +13,9 @@ from rclpy.parameter import Parameter
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.station import check_joinable
 from dtsa_agent.ros.common.graph.names import named
-from dtsa_channel_sim.ros.attendance import LOST_AFTER_S
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+from dtsa_channel_sim.ros.roster import LOST_AFTER_S
 
 from .children import Child, Children, NodeError, describe_end
 from .measurement import FlightMeasurement

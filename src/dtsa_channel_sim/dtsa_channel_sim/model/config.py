@@ -20,6 +20,18 @@ from .topology import Groups, LinkLoss, Matrix, listed, parse_links, parse_matri
 _SLOT_MS = Setting("slot_ms", "float", None, "length of a slot", unit="ms", minimum=1e-6, maximum=1e6)
 
 
+@dataclass(frozen=True, slots=True)
+class AnswerLimits(Settings):
+    """Wall time that agents have to answer."""
+
+    startup_s: float = setting(
+        60.0, "wall time that all agents have to answer slot 0", unit="s", minimum=0.1, maximum=86400
+    )
+    answer_s: float = setting(
+        10.0, "wall time that all agents have to answer any later slot", unit="s", minimum=0.1, maximum=86400
+    )
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class ChannelConfig(Settings):
     """Everything that the channel's behaviour depends on. Models and formulas: docs/reference/channel.md.

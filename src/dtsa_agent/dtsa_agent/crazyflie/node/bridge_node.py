@@ -28,9 +28,9 @@ from dtsa_agent.crazyflie.safety.rules import SafetySettings
 from dtsa_agent.crazyflie.settings.config import SwarmSettings, load_swarm
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_agent.ros.common.graph.parameters import declare_settings
+from dtsa_agent.ros.common.process.loop import Serving
 from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
 from dtsa_agent.ros.common.process.priority import stay_on_one_processor, take_priority
-from dtsa_agent.ros.common.process.serving import Serving
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 
 from .bridge import Bridge

@@ -28,7 +28,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Feed
 from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.wire.intake import Intake
+from dtsa_agent.ros.common.wire.checks import Intake
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 
 from .follower import Follower

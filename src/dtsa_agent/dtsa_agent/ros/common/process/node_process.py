@@ -46,7 +46,7 @@ def follow_supervisor() -> bool:
 
 
 def node_options(supervised: bool) -> dict[str, Any]:
-    """Return arguments for ``Node``: a supervised node goes without services that are never asked, and starts faster."""
+    """Return arguments for ``Node``: a supervised node goes without services that nothing asks, and starts faster."""
     if not supervised:
         return {}
     silent = Parameter("start_type_description_service", value=False)
