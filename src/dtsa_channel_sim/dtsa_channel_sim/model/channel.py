@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from .config import ChannelConfig
 from .losses import NoiseSource
 from .medium import Medium, OnAir
-from .schedule import Change, Epoch, Timeline
+from .schedule import Change, Timeline
 from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 Positions = NDArray[np.float64]
@@ -113,7 +113,7 @@ class Channel:
         """Make the settings of a slot the present ones."""
         if slot < 0:
             raise LocalProtocolError(f"slot {slot}: slots count from 0")
-        epoch: Epoch[ChannelConfig] = self._timeline.at(slot)
+        epoch = self._timeline.at(slot)
         self._first, self._end = epoch.first, _FOREVER if epoch.end is None else epoch.end
         self._medium = Medium(epoch.config, self._source)
         self._losses = self._medium.losses
