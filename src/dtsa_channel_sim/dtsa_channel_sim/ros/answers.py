@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import isnan
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +21,7 @@ Places = slice | NDArray[np.intp]
 
 _DECIDED = ("chosen", "reason", "digest", "score")
 _MOTION = ("track", "velocity", "command", "goal")
+_SEQUENCES = attrgetter("length", *_DECIDED, *_MOTION[:-1])  # the goal may be left out
 _LONGEST = 2000  # slots in one report
 _MOST_HEARD = 20_000  # received frames in one report
 _FARTHEST_OFF_NS = 60_000_000_000  # no agent's slot is farther from the channel's
@@ -62,6 +65,7 @@ class Answers:
         self.taken_in: list[TakenIn] | None = None  # real time: what the agents report to have received in the slot
         self._goal_known = np.zeros(agents, dtype=np.bool_)
         self._places: dict[bytes, Places] = {}
+        self._lengths: dict[int, tuple[int, ...]] = {}  # of the fields of answers that fit, by number of agents
 
     @property
     def position(self) -> Array:
@@ -87,20 +91,22 @@ class Answers:
         at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
         if self.answered[at].any():
             return False
-        sizes = {"length": count, **sizes_of(count, self.steps)}
-        _check_sizes(message, sizes, self.steps, "an unusable answer")
+        lengths = (message.steps, *map(len, _SEQUENCES(message)))
+        if lengths != self._lengths.get(count) or len(message.goal) not in (0, 24 * count):
+            _check_sizes(message, {"length": count, **sizes_of(count, self.steps)}, self.steps, "an unusable answer")
+            self._lengths[count] = lengths
         frames: list[bytes] = []
         if message.data or any(message.length):
             check_frames(message.length, message.data)
             frames = split_frames(message.data, message.length)
         motion = np.frombuffer(b"".join([getattr(message, name) for name in _MOTION]))
         chosen, score = np.frombuffer(message.chosen, dtype=np.uint16), np.frombuffer(message.score)
-        if chosen.max() > self.agents:
+        if max(chosen.tolist()) > self.agents:
             raise _unusable(RANGE, message, f"{chosen.max()} chosen of {self.agents} agents")
         # A sum of squares is finite only if all its terms are, and small only if they are.
         if not motion.dot(motion) <= FARTHEST_M**2:
             raise _unusable(RANGE, message, "positions, velocities or goals that are no numbers, or far away")
-        if np.isnan(score).any():
+        if any(map(isnan, score.tolist())):
             raise _unusable(RANGE, message, "scores that are no numbers")
         self._motion[: len(motion) // count, at] = motion.reshape(-1, count)
         self.chosen[at], self.score[at] = chosen, score

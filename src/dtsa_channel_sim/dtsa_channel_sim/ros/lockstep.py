@@ -6,20 +6,19 @@ import time
 from typing import Any
 
 import numpy as np
-from dtsa_msgs.msg import Slot, Transmission
+from dtsa_msgs.msg import Transmission
 from rclpy.node import Node
-from rclpy.serialization import serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.waiting import Patience
 from dtsa_agent.ros.common.wire.checks import OTHER_RUN, OTHER_SENDER, SLOT, Unusable
-from dtsa_agent.ros.common.wire.messages import TRANSMISSION, header_of
+from dtsa_agent.ros.common.wire.messages import TRANSMISSION
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .ros_channel import REPEAT_S, RosChannel, put_frames
+from .ros_channel import REPEAT_S, RosChannel
 
 _REPEAT_LATER_S = 0.5  # a slot is sent again so often until all agents have answered it; slot 0 more often
 _GARBAGE_PATIENCE_S = 0.5
@@ -66,17 +65,18 @@ class LockstepChannel(RosChannel):
     def _open(self, slot: int, frames: dict[int, bytes], verdict: Verdict | None) -> None:
         """Publish the message that opens a slot."""
         time_ns = names.slot_time_ns(slot, self.slot_ns)
-        header = header_of(time_ns)
-        message = Slot(header=header, run=self.run_id, slot=slot, phase=Slot.RUN, heard_slot=max(slot - 1, 0))
+        heard_slot = max(slot - 1, 0)
         if verdict is not None and verdict.senders:
             mask = verdict.mask(self.agents)
             heard = np.flatnonzero(mask.any(axis=1))
             senders = [verdict.senders[row] for row in heard]
-            put_frames(message, senders, [frames[sender] for sender in senders], mask[heard])
+            received = [frames[sender] for sender in senders]
+            self._bytes = self._pack_slot(time_ns, slot, heard_slot, senders, received, mask[heard])
+        else:
+            self._bytes = self._pack_slot(time_ns, slot, heard_slot)
         self.slot, self._complaint = slot, ""
-        self._bytes = serialize_message(message)
         self._publisher.publish(self._bytes)
-        self._publish_clock(header.stamp)
+        self._publish_clock(time_ns)
         self._observers.slot_published(slot, self._bytes, time_ns)
 
     def _collect(self, slot: int, stop: object) -> bool:

@@ -12,21 +12,21 @@ import numpy as np
 from dtsa_msgs.msg import Frame, Report, Slot
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.agents.delays import Delays
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Feed
 from dtsa_agent.ros.common.wire.checks import RANGE, SIZES, Unusable, check_start
-from dtsa_agent.ros.common.wire.messages import Fields, header_of, ns_of, read_report, time_of
+from dtsa_agent.ros.common.wire.messages import Fields, header_of, ns_of, read_report
 from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 from .answers import Accounts, Answers, Delivered
-from .ros_channel import RosChannel, put_frames
+from .ros_channel import RosChannel
 from .roster import Attendance, RollCall
 
 _NS = 1_000_000_000
@@ -402,9 +402,7 @@ class RealtimeChannel(RosChannel):
             return
         frame = self.air.frames[verdict.frame_id]
         time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
-        message = Slot(header=header_of(time_ns), run=self.run_id, slot=slot, phase=Slot.RUN, heard_slot=slot)
-        put_frames(message, [sender], [frame], verdict.received[None])
-        data = bytes(serialize_message(message))
+        data = self._pack_slot(time_ns, slot, slot, (sender,), (frame,), verdict.received[None])
         self._publisher.publish(data)
         self.accounts.deliver(slot, sender, Delivered(frame, verdict.arrival_ns, verdict.received))
         self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
@@ -456,7 +454,7 @@ class RealtimeChannel(RosChannel):
         frames, verdict = self._verdict(slot)
         book.taken_in = self.accounts.taken_in(slot)
         self._observers.judged(slot, book, frames, verdict)
-        self._publish_clock(time_of(names.slot_time_ns(slot, self.slot_ns)))
+        self._publish_clock(names.slot_time_ns(slot, self.slot_ns))
         self._observers.slot_over(slot, book, verdict)
         self.slot = slot
         here = book.answered.copy()

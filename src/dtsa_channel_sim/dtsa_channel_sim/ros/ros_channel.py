@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from dtsa_msgs.msg import Process, Slot
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -30,6 +29,7 @@ from dtsa_agent.ros.common.wire.checks import (
     add_counts,
     check_slot,
 )
+from dtsa_agent.ros.common.wire.messages import SLOT, time_of
 from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
@@ -240,6 +240,15 @@ class RosChannel:
             raise Unusable(OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
         return message
 
+    def _pack_slot(
+        self, time_ns: int, slot: int, heard_slot: int, senders: Any = (), frames: Any = (), mask: Any = None
+    ) -> bytes:
+        """Return the message that opens a slot or delivers frames, by their receivers' mask (F, N)."""
+        return SLOT.pack(time_ns, (
+            self.run_id, slot, Slot.RUN, heard_slot, array("H", senders).tobytes(), bytes(map(len, frames)),
+            b"".join(frames), b"" if mask is None else pack_received(mask),
+        ))  # fmt: skip
+
     def _hear_processes(self) -> None:
         """Process what processes say about themselves.
 
@@ -282,9 +291,9 @@ class RosChannel:
         self._observers.all_answered(slot, answers)
         return not self._referee.over(slot, answers)
 
-    def _publish_clock(self, stamp: Time) -> None:
+    def _publish_clock(self, time_ns: int) -> None:
         if self._clock_watched:
-            self._clock.publish(Clock(clock=stamp))
+            self._clock.publish(Clock(clock=time_of(time_ns)))
 
     def _publish_end(self) -> None:
         """Tell all nodes that the run is over."""
@@ -320,11 +329,3 @@ class RosChannel:
                 break
             self._publish_end()
         self._hear_processes()  # they end with their last counts
-
-
-def put_frames(message: Slot, senders: list[int], frames: list[bytes], received: Any) -> None:
-    """Put frames that some agent received into a slot message."""
-    message.sender = array("H", senders)
-    message.length = array("B", [len(frame) for frame in frames])
-    message.data = array("B", b"".join(frames))
-    message.received = array("B", pack_received(received))
