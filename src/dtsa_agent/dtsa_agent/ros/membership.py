@@ -18,19 +18,8 @@ from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.runs import Call, run_text
 from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire.checks import (
-    FORGED_END,
-    OTHER_RUN,
-    OTHER_SENDER,
-    RANGE,
-    Intake,
-    OnePublisher,
-    Unusable,
-    add_counts,
-    check_slot,
-    parse_json,
-    plain,
-)
+from dtsa_agent.ros.common.wire import checks
+from dtsa_agent.ros.common.wire.checks import Intake, OnePublisher, Unusable
 from dtsa_agent.ros.common.wire.messages import Fields
 
 _GONE_S = 6.0  # a channel that nobody has seen for so long will not come back; it announces itself every 3 s
@@ -98,28 +87,28 @@ class Membership:
         return True
 
     def _check(self, message: Fields, sender: bytes | None) -> None:
-        check_slot(message, self._agents)
+        checks.check_slot(message, self._agents)
         run, phase = message.run, message.phase
         calls = phase in (Slot.PREPARE, Slot.START)
         if self.run and run != self.run:
             if phase == Slot.PREPARE:
                 self._following = run
                 self._publish_counts(left_over=True)
-            raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}; this one is {run_text(self.run)}")
+            raise Unusable(checks.OTHER_RUN, f"slot message of run {run_text(run)}; this one is {run_text(self.run)}")
         caller = self._callers.get(run)
         if caller is None:
             if not calls:
-                raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}, which has not called this process")
+                raise Unusable(checks.OTHER_RUN, f"slot message of run {run_text(run)}, which has not called here")
             caller = self._meet(run, message.data, sender)
         if phase == Slot.END:
             if not caller.call.ended_by(message.data):
-                raise Unusable(FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
+                raise Unusable(checks.FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
             self._told_s = 0.0
             self._publish_counts()
             return
         self._check_next(message)
         if not caller.publisher.admits(time.monotonic(), sender):
-            raise Unusable(OTHER_SENDER, f"a slot message of run {run_text(run)}, not of its channel")
+            raise Unusable(checks.OTHER_SENDER, f"a slot message of run {run_text(run)}, not of its channel")
         if phase == Slot.REFUSE:
             self._refused(message.data)
         if phase == Slot.PREPARE or (calls and caller.introductions < _INTRODUCTIONS):
@@ -129,11 +118,11 @@ class Membership:
     def _meet(self, run: int, data: bytes, sender: bytes | None) -> _Caller:
         """A channel calls for the first time."""
         if not run:
-            raise Unusable(OTHER_RUN, "a call without a run")
+            raise Unusable(checks.OTHER_RUN, "a call without a run")
         try:
             call = Call.from_bytes(data)
         except ValueError as error:
-            raise Unusable(RANGE, f"a call of nobody: {error}") from None
+            raise Unusable(checks.RANGE, f"a call of nobody: {error}") from None
         while len(self._callers) >= _MOST_CALLERS:
             del self._callers[next(run for run in self._callers if run != self.run)]
         caller = self._callers[run] = _Caller(call, sender)
@@ -161,14 +150,14 @@ class Membership:
         if int.from_bytes(data[:8], "little") != self._process:
             return
         if self.run and time.monotonic() - self._began_s > _REFUSED_S:
-            raise Unusable(OTHER_SENDER, "this process takes part, and is told to go")
+            raise Unusable(checks.OTHER_SENDER, "this process takes part, and is told to go")
         try:
-            reason = parse_json(data[8:])
+            reason = checks.parse_json(data[8:])
         except ValueError:
             reason = None
         if not isinstance(reason, list) or len(reason) != 3:
-            raise Unusable(RANGE, "a refusal without a reason")
-        raise ConfigError(plain(str(reason[0])), reason[1], plain(str(reason[2])))
+            raise Unusable(checks.RANGE, "a refusal without a reason")
+        raise ConfigError(checks.plain(str(reason[0])), reason[1], checks.plain(str(reason[2])))
 
     def _publish_counts(self, left_over: bool = False) -> None:
         """Publish the counts of this run's messages, not too often."""
@@ -196,7 +185,7 @@ class Membership:
     def counts(self) -> dict[str, int]:
         """Return the number of messages and frames not received so far, by reason."""
         counts = dict(self.intake.counts)
-        add_counts(counts, {name: count for name, count in self._dropped_frames().items() if count})
+        checks.add_counts(counts, {name: count for name, count in self._dropped_frames().items() if count})
         return counts
 
     def idle(self, publishers: int, slot: int) -> None:

@@ -20,15 +20,8 @@ from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.loop import Feed, Loop
 from dtsa_agent.ros.common.process.runs import Run, run_text
 from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire.checks import (
-    OTHER_RUN,
-    OTHER_SENDER,
-    UNREADABLE,
-    Intake,
-    Unusable,
-    add_counts,
-    check_slot,
-)
+from dtsa_agent.ros.common.wire import checks
+from dtsa_agent.ros.common.wire.checks import Intake, Unusable
 from dtsa_agent.ros.common.wire.messages import SLOT, time_of
 from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_channel_sim.model.channel import Channel
@@ -115,7 +108,7 @@ class RosChannel:
     def dropped(self) -> dict[str, int]:
         """Return the number of messages and frames that the channel and the agents have dropped, by reason."""
         total = dict(self.intake.counts)
-        add_counts(total, self.roster.dropped())
+        checks.add_counts(total, self.roster.dropped())
         return total
 
     def observe(self, *observers: ChannelObserver) -> None:
@@ -203,7 +196,7 @@ class RosChannel:
                 if message.run in (0, self.run_id) or len(heard) >= _MOST_PROCESSES:
                     continue
                 with self.intake.guard():
-                    check_slot(message, self.agents)
+                    checks.check_slot(message, self.agents)
                     now = time.monotonic()
                     waited = now - heard.setdefault(message.run, now)
                     others = ", ".join(self._other_nodes(topic)) if waited > _OTHER_CHANNEL_S else ""
@@ -235,9 +228,9 @@ class RosChannel:
         try:
             message = read(data)
         except Exception:  # rclpy has no common base for what a message can do to it
-            raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
+            raise Unusable(checks.UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
         if message.run != self.run_id:
-            raise Unusable(OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
+            raise Unusable(checks.OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
         return message
 
     def _pack_slot(
@@ -265,7 +258,7 @@ class RosChannel:
                     self._refuse(message.process, error)
                     if not self.roster.closed:
                         raise
-                    self.intake.drop(OTHER_SENDER, f"{message.node}: {error}")
+                    self.intake.drop(checks.OTHER_SENDER, f"{message.node}: {error}")
 
     def _refuse(self, process: int, error: ConfigError) -> None:
         """Tell a process that it cannot take part."""

@@ -21,18 +21,8 @@ from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.loop import Feed
 from dtsa_agent.ros.common.process.runs import run_text
-from dtsa_agent.ros.common.wire.checks import (
-    OTHER_RUN,
-    OTHER_SENDER,
-    RANGE,
-    UNKNOWN,
-    OnePublisher,
-    Unusable,
-    add_counts,
-    check_process,
-    parse_json,
-    plain,
-)
+from dtsa_agent.ros.common.wire import checks
+from dtsa_agent.ros.common.wire.checks import OnePublisher, Unusable
 from dtsa_agent.ros.common.wire.messages import Fields, read_report
 
 from .answers import Accounts, Answers
@@ -118,16 +108,16 @@ class Roster:
         :raises ConfigError: if it cannot take part, naming setting, both values and node.
         :raises Unusable: for a message that cannot be, or of another run.
         """
-        check_process(message, self._agents)
-        message.node = plain(message.node)
+        checks.check_process(message, self._agents)
+        message.node = checks.plain(message.node)
         if message.run != self._run:
             self._hear_other(message, now_s)
-            raise Unusable(OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
+            raise Unusable(checks.OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
         member = self._members.get(message.process) or self._meet(message, now_s, sender)
         if member.sender != sender:
-            raise Unusable(OTHER_SENDER, f"a message about {message.node} that is not its own")
+            raise Unusable(checks.OTHER_SENDER, f"a message about {message.node} that is not its own")
         if member.ids != tuple(message.agent):
-            raise Unusable(UNKNOWN, f"{message.node} for other agents than before")
+            raise Unusable(checks.UNKNOWN, f"{message.node} for other agents than before")
         member.heard_s = now_s
         member.dropped = dict(zip(message.dropped_reason, message.dropped, strict=True))
         for rival, since_s in () if self.closed else self._rivals.values():
@@ -144,7 +134,7 @@ class Roster:
         self._compare(message)
         if any(agent in self._of for agent in member.ids):
             if len(self._rivals) >= _MOST_STRANGERS:
-                raise Unusable(UNKNOWN, "too many processes for the same agents")
+                raise Unusable(checks.UNKNOWN, "too many processes for the same agents")
             self._rivals[member.process] = (member, now_s)
         else:
             self._replace(member)
@@ -155,7 +145,7 @@ class Roster:
         for agent in member.ids:
             before = self._of.get(agent)
             if before is not None and self._members.pop(before.process, None):
-                add_counts(self._gone, before.dropped)
+                checks.add_counts(self._gone, before.dropped)
                 del self._groups[_key(before.ids)]
                 for other in before.ids:
                     self._of.pop(other, None)
@@ -176,11 +166,11 @@ class Roster:
         :raises Unusable: if they are none.
         """
         try:
-            given = parse_json(message.settings)
+            given = checks.parse_json(message.settings)
         except ValueError:
             given = None
         if not isinstance(given, dict) or settings_hash(given) != message.settings_hash:
-            raise Unusable(RANGE, f"{message.node} says nothing about its settings")
+            raise Unusable(checks.RANGE, f"{message.node} says nothing about its settings")
         for name in sorted(self._agreed):
             if name not in given or given[name] != self._agreed[name]:
                 allowed = f"{self._agreed[name]!r}, as {self._agreed_by[name]} has it"
@@ -206,23 +196,23 @@ class Roster:
         """Check that a message can be from the process that has some agents."""
         member = self._groups.get(ids.tobytes())
         if member is None:
-            raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
+            raise Unusable(checks.UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
         if not member.publisher.admits(now_s, sender):
-            raise Unusable(OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}")
+            raise Unusable(checks.OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}")
 
     def check_frame(self, agent: int, now_s: float, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
         member = self._of.get(agent)
         if member is None:
-            raise Unusable(UNKNOWN, f"a frame of cf{agent}, which no process has")
+            raise Unusable(checks.UNKNOWN, f"a frame of cf{agent}, which no process has")
         if not member.publisher.admits(now_s, sender):
-            raise Unusable(OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
+            raise Unusable(checks.OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
 
     def dropped(self) -> dict[str, int]:
         """Return the number of messages that all processes have dropped, by reason."""
         total = dict(self._gone)
         for member in self._members.values():
-            add_counts(total, member.dropped)
+            checks.add_counts(total, member.dropped)
         return total
 
 
