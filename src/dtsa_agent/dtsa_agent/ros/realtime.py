@@ -183,19 +183,13 @@ class RealtimeAgent:
 class RealtimeNode(AgentsNode):
     """Agents that begin their slots by themselves.
 
-    The time line is the channel's: ns from the start of slot 0. An agent's slot starts when its own clock says so; that
-    is off by an offset and a drift, and by what the agent has learned from others' frames. As on a vehicle, where a
-    timer sends what lies ready, decisions are made a little before. A frame carries the time at which its agent starts
-    to send it: its slot's start, or later if it was not ready by then.
-
-    A process that was there at the channel's call begins with slot 0. One that comes later is told where the time line
-    lies, too, because the stamps of messages are on it; but its agents take the time of their slots from the first
-    frame that each hears, and know nothing.
+    As on a vehicle, where a timer sends what lies ready, decisions are made a little before a slot. A frame carries the
+    time at which its agent starts to send it: its slot's start, or later if it was not ready by then. A process that
+    comes after the channel's call is told where the time line lies, too, because the stamps of messages are on it.
 
     :param ids: of the agents that live here, ascending.
     :param authenticator: holds the key, if the settings say that frames are authenticated.
-    :param offset_ns: (L,) ns, offset of each agent's clock: positive clocks are early.
-    :param drift_ppb: (L,) parts per billion by which each runs fast.
+    :param clocks: one an agent, on the channel's time line; none: without offset and drift.
     :param jitter_ns: ns, standard deviation of the time of a single transmission.
     :param align: whether agents move their slots towards what they hear.
     :param flight_time_ns: ns from the order to send a frame until the receivers' flight processors have it.
@@ -214,8 +208,7 @@ class RealtimeNode(AgentsNode):
         swarm_namespace: str = names.SWARM,
         *,
         authenticator: Authenticator | None = None,
-        offset_ns: Sequence[int],
-        drift_ppb: Sequence[int],
+        clocks: Sequence[ClockMap] = (),
         jitter_ns: float = 0.0,
         align: bool = True,
         flight_time_ns: int = 0,
@@ -225,13 +218,11 @@ class RealtimeNode(AgentsNode):
         self.slot_ns, self._flight_ns = config.slot_ns, flight_time_ns
         self._authenticator, self._align = authenticator, align
         scenario = make_scenario(config)
+        clocks = clocks or [ClockMap(began_ns=0)] * len(ids)
         self.agents = [
-            RealtimeAgent(
-                agent, config, scenario, ClockMap(offset, drift, 0), jitter_ns,
-                partial(self._accepted, index), self._refuse,
-            )
-            for index, (agent, offset, drift) in enumerate(zip(ids, offset_ns, drift_ppb, strict=True))
-        ]  # fmt: skip
+            RealtimeAgent(agent, config, scenario, clock, jitter_ns, partial(self._accepted, index), self._refuse)
+            for index, (agent, clock) in enumerate(zip(ids, clocks, strict=True))
+        ]
         self._columns = np.array(ids) - 1
         self._refused = 0  # frames that reached an agent and were refused, over all agents
         self._faults: set[str] = set()  # why agents have refused the present frame

@@ -127,7 +127,7 @@ def host_agents(
 
 
 def _realtime(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, priority: int) -> AgentsNode:
-    from .realtime import RealtimeNode
+    from .realtime import ClockMap, RealtimeNode
 
     def whole_numbers(name: str, count: int, text: str) -> list[int]:
         values = declare_list(node, name, [0], text)
@@ -154,8 +154,7 @@ def _realtime(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, p
         ids,
         space,
         authenticator=authenticator(config),
-        offset_ns=offset,
-        drift_ppb=drift,
+        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)],
         jitter_ns=own.clock_jitter_ns,
         align=own.align,
         flight_time_ns=fixed + per_byte * config.frame_length,

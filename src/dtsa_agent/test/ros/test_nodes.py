@@ -154,6 +154,8 @@ def test_strange_slots_and_forged_ends_change_nothing_and_a_node_ends_when_its_c
     (AGENT, ["air:=smoke"], "agent: error: air: got 'smoke'"),
     (AGENT, ["air:=udp", "auth:=false"], "agent: error: interface: got ''"),
     (HOST, ["ids:=[1, 1]"], "swarm_host: error: ids: got [1, 1]; allowed: different ids from 1 to 12"),
+    (HOST, ["ids:=3"], "swarm_host: error: ids: got 3; allowed: a list of whole numbers, as [0]"),
+    (HOST, ["mode:=realtime", "nice:=20"], "swarm_host: error: nice: got 20; allowed: a whole number, 0 to 19"),
     (HOST, ["policy:=aloha", "shared_table:=true"], "swarm_host: error: shared_table: got True; allowed: false"),
 ])  # fmt: skip
 def test_bad_parameters_are_one_line_and_code_2(tmp_path: Path, module: str, arguments: list[str], said: str) -> None:

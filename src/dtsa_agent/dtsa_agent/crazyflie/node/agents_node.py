@@ -140,9 +140,9 @@ def _body(stop: Stop, supervised: bool) -> None:
         ids = declare_ids(node, config.agents)
         station = StationNodeSettings(**declare_settings(node, StationNodeSettings))
         take_priority(station.priority)
-        zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
-        more = {"authenticator": authenticator(config), "offset_ns": zero, "drift_ppb": zero, "align": False}
-        agents = StationNode(node, config, ids, space, command_hz=station.command_hz, **more)
+        # One station, one clock: no offsets, and nothing to align.
+        more = {"authenticator": authenticator(config), "align": False, "command_hz": station.command_hz}
+        agents = StationNode(node, config, ids, space, **more)
         try:
             agents.run(stop)
         finally:
