@@ -157,10 +157,7 @@ class Channel:
             self._medium.judge(slot, on_air[k], on_air[:k] + on_air[k + 1 :], positions)
             for k in range(first, len(on_air))
         ]
-        received = np.array([reception.received for reception in receptions])
-        lost = tuple(reception.lost for reception in receptions)
-        collided = tuple(reception.collided for reception in receptions)
-        return Verdict(COLLISION if any(collided) else SUCCESS, senders, received, lost, collided)
+        return Verdict.of(senders, receptions)
 
     def _sent(self, slot: int, senders: tuple[int, ...], lengths: Sequence[int] | None) -> list[OnAir]:
         """Return the transmissions of a slot: all start with it."""

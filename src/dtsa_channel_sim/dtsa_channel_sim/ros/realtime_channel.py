@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from functools import partial
 from heapq import heappop, heappush
 from typing import Any
@@ -23,7 +22,7 @@ from dtsa_agent.ros.common.wire.messages import Fields, header_of, ns_of, read_r
 from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
-from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
+from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Accounts, Answers, Delivered
 from .ros_channel import RosChannel
@@ -147,19 +146,6 @@ class LiveAir:
         """Return for how long there is nothing to do, ns, at most ``most_ns``."""
         arrival = self._arriving[0][0] if self._arriving else NEVER
         return min(max(0, min(self._air.due_ns + self.hold_ns, arrival) - now), most_ns)
-
-
-def slot_verdict(settled: Sequence[FrameVerdict[Sent]]) -> Verdict:
-    """Return what the air did in a slot, frame by frame."""
-    if not settled:
-        return Verdict(IDLE, (), None, None, None)
-    return Verdict(
-        COLLISION if any(verdict.collided for verdict in settled) else SUCCESS,
-        tuple(verdict.sender for verdict in settled),
-        np.array([verdict.received for verdict in settled]),
-        tuple(verdict.lost for verdict in settled),
-        tuple(verdict.collided for verdict in settled),
-    )
 
 
 class RealtimeChannel(RosChannel):
@@ -480,4 +466,4 @@ class RealtimeChannel(RosChannel):
         """Return what the air did in one slot, frame by frame."""
         settled = self._settled.pop(slot, [])
         frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in settled}
-        return frames, slot_verdict(settled)
+        return frames, Verdict.of([verdict.sender for verdict in settled], settled)
