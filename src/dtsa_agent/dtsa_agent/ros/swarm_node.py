@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from dtsa_msgs.msg import Slot, Transmission
@@ -167,24 +168,22 @@ class SwarmNode(AgentsNode):
         :returns: done when the run is over; holds the error if one ended it.
         """
         over = Future()
+        next_idle_s = 0.0
 
-        def guarded(act: Callable[[], bool]) -> Callable[[], None]:
-            def call() -> None:
-                try:
-                    if not over.done() and not act():
-                        over.set_result(None)
-                except DtsaError as error:
-                    over.set_exception(error)
+        def serve() -> None:
+            nonlocal next_idle_s
+            try:
+                # The loop pops messages itself: one that cannot be read would end an executor that pops it.
+                message = None if over.done() else self.loop.take()
+                if message is not None and not self.on_slot(message):
+                    over.set_result(None)
+                if not over.done() and time.monotonic() >= next_idle_s:
+                    next_idle_s = time.monotonic() + HOUSEKEEPING_S
+                    self.idle()
+            except DtsaError as error:
+                over.set_exception(error)
 
-            return call
-
-        def serve() -> bool:
-            message = self.loop.take()
-            return message is None or self.on_slot(message)
-
-        # The loop pops messages itself: one that cannot be read would end an executor that pops it.
-        self.node.create_timer(_SERVE_S, guarded(serve))
-        self.node.create_timer(HOUSEKEEPING_S, guarded(lambda: self.idle() is None))
+        self.node.create_timer(_SERVE_S, serve)
         return over
 
     def on_slot(self, message: Fields) -> bool:

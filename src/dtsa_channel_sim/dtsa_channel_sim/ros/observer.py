@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -112,50 +113,50 @@ class SlotLimit(Referee):
 
 
 class Observers(ChannelObserver):
-    """Passes every event on to any number of observers."""
+    """Passes every event on to any number of observers; an error of one that is no DtsaError names it."""
 
     def __init__(self) -> None:
-        self._called: dict[str, list[tuple[ChannelObserver, Callable[..., None]]]] = {name: [] for name in _EVENTS}
+        self._calls: dict[str, list[Callable[..., None]]] = {name: [] for name in _EVENTS}
 
     def add(self, observer: ChannelObserver) -> None:
         """Add an observer; it is called after those that are there already."""
         for name in _EVENTS:
             if getattr(type(observer), name) is not getattr(ChannelObserver, name):
-                self._called[name].append((observer, getattr(observer, name)))
+                self._calls[name].append(_naming(observer, getattr(observer, name)))
 
     def close(self) -> None:
         """Close all observers, also when some of them fail.
 
         :raises DtsaError: the first failure.
         """
-        called, self._called["close"] = self._called["close"], []
-        failures = [failure for entry in called if (failure := _failure(*entry))]
-        if failures:
-            raise failures[0]
+        if not self._calls["close"]:
+            return
+        close = self._calls["close"].pop(0)
+        try:
+            close()
+        except DtsaError:
+            with suppress(DtsaError):
+                self.close()
+            raise
+        self.close()
 
 
-def _call(observer: ChannelObserver, event: Callable[..., None], *arguments: object) -> None:
-    """Call an observer; an error that is no DtsaError names it."""
-    try:
-        event(*arguments)
-    except DtsaError:
-        raise
-    except Exception as error:
-        raise ObserverError(observer, error) from error
+def _naming(observer: ChannelObserver, event: Callable[..., None]) -> Callable[..., None]:
+    def call(*arguments: object) -> None:
+        try:
+            event(*arguments)
+        except DtsaError:
+            raise
+        except Exception as error:
+            raise ObserverError(observer, error) from error
 
-
-def _failure(observer: ChannelObserver, close: Callable[..., None]) -> DtsaError | None:
-    try:
-        _call(observer, close)
-    except DtsaError as error:
-        return error
-    return None
+    return call
 
 
 def _forward(event: str) -> Any:
     def forward(self: Observers, *arguments: object) -> None:
-        for observer, call in self._called[event]:
-            _call(observer, call, *arguments)
+        for call in self._calls[event]:
+            call(*arguments)
 
     return forward
 
