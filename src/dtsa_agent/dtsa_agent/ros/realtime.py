@@ -3,7 +3,7 @@
 How a flight in real time works, and where each part stands ("channel": `dtsa_channel_sim/ros`):
 
 1. **The time line.** The channel calls all processes (`roster`), then sends START with the time of slot 0 on
-   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own (`air/driver.ClockMap`),
+   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own (`air/port.ClockMap`),
    off by an offset and a drift.
 2. **A slot here.** Each agent is a station (`core/station`) that says when it is due: :meth:`RealtimeNode._serve`. It
    ends the slot before, decides, and gives the frame to send. That is published with the time at which its transmission
