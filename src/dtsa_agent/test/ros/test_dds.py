@@ -17,7 +17,8 @@ from dtsa_agent.ros.common.workarounds.dds import PROFILE, PROFILES, RANGE, TRAN
 
 def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
     plain = {RANGE: "LOCALHOST"}
-    for _ in range(2):  # a supervisor's, and that of its nodes
+    for said in ("LOCALHOST", "SYSTEM_DEFAULT", "LOCALHOST"):  # a supervisor's, and those of its nodes
+        plain[RANGE] = said
         limit_to_machine(plain)
         assert plain == {RANGE: "SYSTEM_DEFAULT", PROFILES[0]: str(PROFILE), PROFILES[1]: str(PROFILE)}
     for other in (

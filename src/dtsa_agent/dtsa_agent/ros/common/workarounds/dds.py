@@ -28,9 +28,10 @@ def limit_to_machine(environment: MutableMapping[str, str]) -> None:
     """
     if not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp").startswith("rmw_fastrtps"):
         return
-    if any(name in environment for name in PROFILES):
+    ours = all(environment.get(name) == str(PROFILE) for name in PROFILES)  # of the process that started this one
+    if not ours and any(name in environment for name in PROFILES):
         return
-    if environment.get(RANGE) != "LOCALHOST" or environment.get(PEERS):
+    if not (ours or environment.get(RANGE) == "LOCALHOST") or environment.get(PEERS):
         environment.setdefault(TRANSPORTS, "UDPv4")
         return
     environment[RANGE] = "SYSTEM_DEFAULT"
