@@ -16,8 +16,8 @@ from dtsa_bench.experiments.sweep import run_config as _run_config
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import CRASHED
 from dtsa_bench.runs.summary_text import result_rows, setting_rows, what_came_of_it, what_flew
-from dtsa_bench.simulation.simulate import Trace
 from dtsa_bench.simulation.simulate import simulate as _simulate
+from dtsa_bench.simulation.slot_arrays import SlotArrays
 from dtsa_channel_sim import OUTCOMES
 
 from ._frames import data_frame
@@ -35,7 +35,7 @@ class Flight:
     observer: int  # id of the agent whose table the trace follows
     moving: NDArray[np.bool_]  # (N,) which agents move; the others hover
     start: NDArray[np.float64]  # (3, N) m, frame map: where the agents start
-    _kept: Trace | None
+    _kept: SlotArrays | None
 
     def __repr__(self) -> str:
         return as_text(f"Flight: {what_flew(self.config)}", self._rows())
@@ -82,14 +82,14 @@ class Flight:
         :raises ConfigError: if the flight was simulated without its trace, or pandas is missing.
         """
         trace = self._trace
-        slot = np.arange(len(trace.senders))
+        slot = np.arange(len(trace))
         return data_frame(
             {
                 "slot": slot,
                 "time_s": slot * self.config.swarm.slot_s,
-                "outcome": [OUTCOMES[outcome] for outcome in trace.outcomes],
-                "senders": [len(senders) for senders in trace.senders],
-                "sender": [senders[0] if senders else 0 for senders in trace.senders],
+                "outcome": [OUTCOMES[outcome] for outcome in trace.outcome],
+                "senders": trace.sent.sum(axis=1),
+                "sender": np.where(trace.sent.any(axis=1), trace.sent.argmax(axis=1) + 1, 0),
             }
         )
 
@@ -100,15 +100,15 @@ class Flight:
         :raises ConfigError: if the flight was simulated without its trace, or pandas is missing.
         """
         trace = self._trace
-        slot = np.arange(len(trace.chosen))
+        slot, column = np.arange(len(trace)), self.observer - 1
         return data_frame(
             {
                 "slot": slot,
                 "time_s": slot * self.config.swarm.slot_s,
                 "agent": np.full(len(slot), self.observer),
-                "chosen": trace.chosen,
-                "reason": [REASONS[code] for code in trace.reasons],
-                "score": trace.scores,
+                "chosen": trace.chosen[:, column].astype(np.int64),
+                "reason": [REASONS[code] for code in trace.reason[:, column]],
+                "score": trace.score[:, column],
             }
         )
 
@@ -119,11 +119,11 @@ class Flight:
         :raises ConfigError: if the flight was simulated without its trace, or pandas is missing.
         """
         trace, swarm = self._trace, self.config.swarm
-        heard = np.stack(trace.heard_slot)
+        heard = trace.heard_slot
         known = heard >= 0
         known[:, self.observer - 1] = False
         slot, column = np.nonzero(known)
-        gap = np.stack(trace.estimates) - np.stack([track[-1] for track in trace.tracks])
+        gap = trace.estimate - trace.position[:, -1]
         return data_frame(
             {
                 "slot": slot,
@@ -132,7 +132,7 @@ class Flight:
                 "agent": column + 1,
                 "age_slots": slot - heard[slot, column],
                 "error_m": np.sqrt((gap**2).sum(axis=1))[slot, column],
-                "counted": (np.stack(trace.in_ap) != 0)[slot, column] & self.moving[column],
+                "counted": (trace.in_ap != 0)[slot, column] & self.moving[column],
             }
         )
 
@@ -151,7 +151,7 @@ class Flight:
         return data_frame(columns)
 
     @property
-    def _trace(self) -> Trace:
+    def _trace(self) -> SlotArrays:
         if self._kept is None:
             raise ConfigError("trace", False, "True in simulate(): this flight did not keep what happened in its slots")
         return self._kept
@@ -183,6 +183,6 @@ def simulate(config: RunConfig | None = None, *, trace: bool = True, observer: i
     run = run_config(**settings) if config is None else config
     if not 1 <= observer <= run.swarm.agents:
         raise ConfigError("observer", observer, f"1 to {run.swarm.agents}")
-    flight = _simulate(run, trace=trace, observer=observer)
+    flight = _simulate(run, log=trace, observer=observer)
     scenario = flight.scenario
-    return Flight(run, flight.summary(), observer, scenario.moving, scenario.start, flight.trace)
+    return Flight(run, flight.summary(), observer, scenario.moving, scenario.start, flight.log)

@@ -84,6 +84,7 @@ class Swarm:
     velocity: Annotated[Floats, "3l"]  # m/s
     command: Annotated[Floats, "3l"]  # m/s, commanded velocity
     goal: Annotated[Floats, "3l"]  # m, where each flies to now
+    known_goal: Annotated[Floats, "3n"]  # m, where all take those who rest
     track: Annotated[Floats, "s3l"]  # m, true positions at the control instants of the last slot
     active: Annotated[Bytes, "l"]  # 0: hovers, does not run its avoider
     final: Annotated[Bytes, "l"]  # no further goal is scheduled
@@ -121,12 +122,11 @@ class Swarm:
         count, steps = len(self.ids), config.steps
         model = flight_model(config.avoider, config.options)
         self._start = np.ascontiguousarray(self.scenario.start, dtype=np.float64)
-        self.known_goal = np.array(self.scenario.target, dtype=np.float64)  # (3, N) m, where all take those who rest
         self._decay = np.zeros((2, DECAY_STEPS))
         lib.dtsa_decay(model.vehicle.tau, config.slot_s / steps, DECAY_STEPS, memory(self._decay, writable=True))
         kernel = ffi.new("swarm *", {
             "config": self._protocol(model), "local_count": count, "table_count": len(tables), "shared": self.shared,
-            "vehicle": model.vehicle.to_dict(),
+            "vehicle": model.vehicle.to_dict(), "announce": config.announce, "goals_known": self.scenario.goals_known,
         })  # fmt: skip
         sizes = {
             "n": config.agents, "v": len(tables), "l": count, "s": steps, "f": FRAME_MAX,
@@ -134,6 +134,7 @@ class Swarm:
         }  # fmt: skip
         self._lend(kernel, sizes)
         self.local[:], self.observer[:], self.final[:] = np.array(self.ids) - 1, np.array(tables) - 1, 1
+        self.known_goal[:] = self.scenario.target
         self.rows = np.arange(count)  # (L,) table of each local agent, unless shared
         self.course: Course | None = self.scenario.course(self.local)  # where they are in the scenario's plan
         self.kernel = ffi.gc(kernel, lib.swarm_close)
@@ -168,7 +169,7 @@ class Swarm:
             profile=PROFILE_EXTENDED if config.extended else profile,
             targets_known=config.targets_known and self.scenario.goals_known,
             position_step=position_step(config.extent_m), key=policy_key(config.seed) if key is None else key,
-            avoid=model.avoider.to_dict(), lease=lease, start=memory(self._start), target=memory(self.known_goal),
+            avoid=model.avoider.to_dict(), lease=lease, start=memory(self._start),
             decay=memory(self._decay), decay_len=DECAY_STEPS,
         )  # fmt: skip
 
@@ -316,7 +317,6 @@ class Swarm:
         swarm.emit(slot)  # lists the senders of the present slot; what this encodes is written over below
         for name in _SHAPES.keys() - {"observer"}:
             getattr(swarm, name)[...] = getattr(self, name)  # the one table becomes everybody's
-        swarm.known_goal[...] = self.known_goal
         swarm.course, swarm.authenticator = self.course, self.authenticator
         return swarm
 

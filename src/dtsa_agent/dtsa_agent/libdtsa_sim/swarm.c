@@ -56,10 +56,11 @@ static const char *check(const swarm *s)
 
 const char *swarm_open(swarm *s)
 {
-    const char *fault = check(s);
     const size_t n = (size_t)s->config.agents, l = (size_t)s->local_count;
-    const size_t bytes = swarm_policy_bytes(&s->config);
+    s->config.target = s->known_goal;
+    const char *fault = check(s);
     if (fault) return fault;
+    const size_t bytes = swarm_policy_bytes(&s->config);
     s->scratch = calloc((size_t)scratch_doubles(s->config.agents), sizeof(double));
     s->ages = calloc(n, sizeof(double));
     s->tables = calloc((size_t)s->table_count + 1, sizeof *s->tables);
@@ -107,6 +108,27 @@ void swarm_reset(swarm *s)
 }
 
 void swarm_restart(swarm *s, int l) { agent_forget(&s->agents[l]); }
+
+/* ---- goals ---- */
+
+/* Only the own state of each agent is looked at. */
+void swarm_advance(swarm *s, course *c, int64_t slot)
+{
+    const int n = s->config.agents, count = s->local_count;
+    const double *last = c->goals + (long)(c->goal_count - 1) * 3 * n;
+    if (course_advance(c, slot, s->position) || slot == 0) {
+        memcpy(s->goal, c->goal, sizeof(double) * 3 * (size_t)count);
+        for (int l = 0; l < count; l++) s->final[l] = (uint8_t)course_is_final(c, l);
+    }
+    /* An agent that waits for its first slot stands at its start, and all know that. */
+    for (int e = 0; e < 3 * n && s->goals_known; e++)
+        s->known_goal[e] = (c->begin[e % n] <= slot ? last : c->start)[e];
+    for (int l = 0; l < count; l++) {
+        const int64_t said = s->sent_slot[(s->shared ? 0 : (long)l * n) + s->local[l]];
+        const int waits = s->announce && said >= 0 && said < c->changed[l];
+        s->active[l] = c->moving[s->local[l]] && c->leg[l] >= 0 && !waits;
+    }
+}
 
 /* ---- decisions and frames ---- */
 

@@ -4,6 +4,7 @@
 #define DTSA_SWARM_H
 
 #include "core.h"
+#include "course.h"
 #include "dtsa_station.h"
 #include "policy/policy.h"
 #include "vehicle.h"
@@ -11,7 +12,9 @@
 typedef struct swarm {
     dtsa_config config;
     int local_count, table_count;
-    int shared; /* one table serves every agent */
+    int shared;      /* one table serves every agent */
+    int announce;    /* an agent with a new goal hovers until it has sent a frame that says so */
+    int goals_known; /* all know where everybody wants to be in each slot */
     vehicle_params vehicle;
 
     /* Borrowed: v = table_count, l = local_count, n = agents; p = swarm_policy_bytes. */
@@ -26,6 +29,7 @@ typedef struct swarm {
     double *priority;                                    /* (v, n) */
     int64_t *counter;                                    /* (v, n) */
     double *position, *velocity, *command, *goal;        /* (3, l) */
+    double *known_goal;                                  /* (3, n) where all take those who rest */
     double *track;                                       /* (steps, 3, l) */
     uint8_t *active, *final, *present;                   /* (l) see core.h */
     uint16_t *chosen;                                    /* (l) */
@@ -53,6 +57,8 @@ void swarm_close(swarm *s);
 
 void swarm_reset(swarm *s);
 void swarm_restart(swarm *s, int l); /* knows nothing but the settings */
+/* A slot begins: goals and activity of the agents, by the plan of the scenario. */
+void swarm_advance(swarm *s, course *c, int64_t slot);
 void swarm_decide(swarm *s, int64_t slot);
 /* Encodes the frames of all whose `sends` is set; lists them in senders; -> their number. */
 int swarm_emit(swarm *s, int64_t slot);

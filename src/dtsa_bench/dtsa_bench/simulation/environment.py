@@ -22,7 +22,7 @@ from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import COMPLETED, CRASHED, FlightMetrics
 from dtsa_channel_sim import OUTCOMES, Channel
 
-from .slotted import SlottedTraffic
+from .simulate import complete_slot
 
 try:
     from gymnasium.spaces import Box, Discrete
@@ -231,7 +231,7 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         self.slot = 0  # the one that begins
         self.senders: tuple[int, ...] = ()  # ids, of the last slot
         self.outcome = 0  # of the last slot, index into OUTCOMES
-        self._carry = SlottedTraffic(self.swarm, Channel(run.air)).slot
+        self._channel = Channel(run.air)
         self.scenario.advance(0, self.swarm)
         self.agents = self.possible_agents[:]
         return self._observations(), {agent: {} for agent in self.agents}
@@ -255,8 +255,7 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         swarm.chosen[...] = np.where(sent, swarm.ids, 0)  # a silent agent says nothing of whom it takes for the sender
         senders, woken = swarm.emit(slot), self.metrics.woken.copy()
         self.metrics.compare_tables(slot, swarm.table_hash, swarm.chosen)
-        verdict, lengths = self._carry(slot, senders)
-        over = self.metrics.update(slot, swarm.track, swarm, verdict.outcome, lengths)
+        verdict, over = complete_slot(swarm, self._channel, self.metrics, slot, senders)
         self.slot, self.senders, self.outcome = slot + 1, verdict.senders, verdict.outcome
         known = np.where(swarm.sent_slot >= woken, swarm.sent_slot, woken - 1)
         counts = self.scenario.moving & (woken >= 0) & ~np.eye(len(names), dtype=np.bool_)

@@ -67,8 +67,8 @@ def test_simulate_is_the_flight_of_the_command(flight: dtsa.Flight) -> None:
     config = dtsa.run_config(agents=6, policy="lease", loss=0.1, seed=3)
     assert isinstance(config, RunConfig)
     assert (config.swarm.policy, config.air.loss, config.air.seed) == ("lease", 0.1, 3)
-    same = simulate(config, trace=True)
-    assert np.array_equal(flight.path, same.trace.positions())
+    same = simulate(config, log=True)
+    assert np.array_equal(flight.path, same.log.positions())
     timeless = dict.fromkeys(("wall_time_s", "realtime_factor"))
     assert flight.summary | timeless == same.summary() | timeless
     bare = dtsa.simulate(config, trace=False)

@@ -21,7 +21,7 @@ def run(**settings: Any) -> RunConfig:
 
 
 def fly(**settings: Any) -> Flight:
-    return simulate(run(**settings), trace=True)
+    return simulate(run(**settings), log=True)
 
 
 def plain(flight: Flight) -> dict[str, Any]:
@@ -41,13 +41,13 @@ def plain(flight: Flight) -> dict[str, Any]:
 def test_without_loss_one_table_for_all_makes_no_difference(policy: str, more: dict[str, Any]) -> None:
     config = run(agents=9, policy=policy, timeout_s=2.0, **{"moving": 8, **more})
     assert may_share(config)
-    one, many = (simulate(config, shared_table=shared, trace=True) for shared in (True, False))
+    one, many = (simulate(config, shared_table=shared, log=True) for shared in (True, False))
     assert one.swarm.sent_slot.shape[0] == 1
     assert many.swarm.sent_slot.shape[0] == 9
-    assert one.trace.senders == many.trace.senders
-    assert one.trace.reasons == many.trace.reasons
-    assert np.array_equal(one.trace.positions(), many.trace.positions())
-    assert np.array_equal(one.trace.estimates, many.trace.estimates)
+    assert one.log.senders() == many.log.senders()
+    assert np.array_equal(one.log.reason, many.log.reason)
+    assert np.array_equal(one.log.positions(), many.log.positions())
+    assert np.array_equal(one.log.estimate, many.log.estimate)
     first, second = plain(one), plain(many)
     error = [first.pop("estimate_error_mean_m"), second.pop("estimate_error_mean_m")]
     assert first == second
@@ -73,7 +73,7 @@ def test_slots_that_a_long_frame_would_outlast_are_flown_with_a_table_each() -> 
 
 def test_the_summary_says_what_the_tracks_say() -> None:
     flight = fly(agents=8, moving=4, avoider="potential", slot_ms=30.0, timeout_s=20.0)
-    summary, positions = flight.summary(), flight.trace.positions()
+    summary, positions = flight.summary(), flight.log.positions()
     assert json.loads(json.dumps(summary)) == summary
     assert summary["end"] == "completed"
     assert len(positions) == 3 * summary["slots"]["total"]
@@ -114,20 +114,20 @@ def test_crashes_and_timeouts_end_flights_and_one_lost_frame_splits_the_views_of
 def test_agents_say_a_new_goal_before_they_fly_and_dtsa_chooses_for_its_reasons() -> None:
     for announce in (True, False):
         flight = fly(agents=6, scenario="staggered", stagger_slots=40, policy="dtsa", announce=announce, timeout_s=6.0)
-        path = np.concatenate((flight.scenario.start[None], flight.trace.positions()))
+        path = np.concatenate((flight.scenario.start[None], flight.log.positions()))
         moved = (np.abs(np.diff(path, axis=0)).max(axis=1) > 0).argmax(axis=0)  # first slot in which each moves
         waited = 0
         for k in range(6):
             begin = flight.scenario.plan.begin[k]
-            said = next(slot for slot, ids in enumerate(flight.trace.senders) if slot >= begin and k + 1 in ids)
+            said = next(slot for slot, ids in enumerate(flight.log.senders()) if slot >= begin and k + 1 in ids)
             if begin:
                 assert moved[k] == (said + 1 if announce else begin)
                 waited += said > begin
         assert waited
     flight = fly(agents=12, moving=6, timeout_s=20.0)
-    seen = {REASONS[code] for code in flight.trace.reasons}
+    seen = {REASONS[code] for code in flight.log.reason[:, 0]}
     assert {"boot", "priority", "tie", "return"} <= seen
-    assert flight.trace.senders[:12] == [(i,) for i in range(1, 13)]
+    assert flight.log.senders()[:12] == [(i,) for i in range(1, 13)]
 
 
 @pytest.mark.ros
@@ -144,13 +144,13 @@ def test_simulate_and_fly_agree_bit_for_bit(tmp_path: Path, agents: int, process
     moving = 2 if agents == 12 else agents
     config = run(agents=agents, moving=moving, loss=loss, timeout_s=1.5, stop_on_crash=False, seed=agents)
     real = fly_nodes(config, tmp_path / "flight", FlightOptions(processes=processes, pictures=False))
-    ours = simulate(config, trace=True)
-    ours_at_start = np.concatenate((ours.scenario.start[None], np.stack([track[-1] for track in ours.trace.tracks])))
+    ours = simulate(config, log=True)
+    ours_at_start = np.concatenate((ours.scenario.start[None], ours.log.position[:, -1]))
     count = min(len(real.positions), len(ours_at_start))
     assert count >= 150
     assert np.array_equal(real.positions[:count], ours_at_start[:count])
-    sent = [(slot, agent) for slot, agent, _ in frames(tmp_path / "flight") if slot < len(ours.trace.senders)]
-    assert sent == [(slot, agent) for slot, ids in enumerate(ours.trace.senders) for agent in ids]
+    sent = [(slot, agent) for slot, agent, _ in frames(tmp_path / "flight") if slot < len(ours.log)]
+    assert sent == [(slot, agent) for slot, ids in enumerate(ours.log.senders()) for agent in ids]
     assert verify_bag(tmp_path / "flight").ok  # frames are those of the protocol, to the byte
     same = {key: value for key, value in plain(ours).items() if key in real.summary}
     # One table is summed up as often as many tables are: the mean's last digit differs.

@@ -109,6 +109,16 @@ class Channel:
             self._use(slot)
         return self._medium
 
+    def lend_losses(self, slot: int, losses: Any) -> int:
+        """Hand C what a frame loses that is alone in its slot.
+
+        :param losses: a ``sim_losses`` (``libdtsa_sim/run.h``).
+        :returns: the slot up to which that holds; 0: :meth:`arbitrate` has to say what becomes of this slot's frames.
+        """
+        if not self._first <= slot < self._end:
+            self._use(slot)
+        return min(self._end, self._losses.lend(slot, losses)) if self._simple else 0
+
     def _use(self, slot: int) -> None:
         """Make the settings of a slot the present ones."""
         if slot < 0:
