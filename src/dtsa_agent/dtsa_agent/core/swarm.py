@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
+from functools import lru_cache
 from typing import Annotated, Any, get_type_hints
 
 import numpy as np
@@ -30,6 +31,15 @@ _NULL = ffi.NULL
 _begin, _fly, _hear, _end, _complete = (  # once a slot
     lib.swarm_begin, lib.swarm_fly, lib.swarm_hear, lib.swarm_end, lib.swarm_complete,
 )  # fmt: skip
+
+
+@lru_cache(maxsize=16)
+def _decay(tau: float, step_s: float) -> Floats:
+    """Return how a vehicle approaches its command (``dtsa_decay``), read-only, (2, DECAY_STEPS)."""
+    decay = np.zeros((2, DECAY_STEPS))
+    lib.dtsa_decay(tau, step_s, DECAY_STEPS, memory(decay, writable=True))
+    decay.setflags(write=False)
+    return decay
 
 
 class SlotOutcome(IntEnum):
@@ -122,8 +132,7 @@ class Swarm:
         count, steps = len(self.ids), config.steps
         model = flight_model(config.avoider, config.options)
         self._start = np.ascontiguousarray(self.scenario.start, dtype=np.float64)
-        self._decay = np.zeros((2, DECAY_STEPS))
-        lib.dtsa_decay(model.vehicle.tau, config.slot_s / steps, DECAY_STEPS, memory(self._decay, writable=True))
+        self._decay = _decay(model.vehicle.tau, config.slot_s / steps)
         kernel = ffi.new("swarm *", {
             "config": self._protocol(model), "local_count": count, "table_count": len(tables), "shared": self.shared,
             "vehicle": model.vehicle.to_dict(), "announce": config.announce, "goals_known": self.scenario.goals_known,
@@ -210,7 +219,7 @@ class Swarm:
             tables = _NULL if heard is None else heard.tobytes()
             if heard is not None and heard.shape != (len(senders), len(self.observer)):
                 raise ValueError(f"heard: shape {heard.shape}")
-            _complete(self.kernel, slot, all_hear, tables)
+            _complete(self.kernel, slot, 0, all_hear, tables)
             return
         frames = [self.frame(index) for index in senders]
         self.fly(slot)
@@ -236,7 +245,7 @@ class Swarm:
 
     def fly(self, slot: int) -> None:
         """Commands and motion of the local agents during a slot, :meth:`steer` and :meth:`move` at each instant."""
-        _fly(self.kernel, slot)
+        _fly(self.kernel, slot, 0)
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         """Fills ``command`` for one control instant, 0 .. steps; ``estimate``: whether to fill the estimates first."""

@@ -84,27 +84,38 @@ static int arrived(const metrics *m, const double *now)
     return 1;
 }
 
+DTSA_SIMD
+static void gaps(int n, const double *restrict p, const double *restrict truth,
+                 double *restrict gap)
+{
+    for (int k = 0; k < n; k++) {
+        const double dx = p[k] - truth[k], dy = p[n + k] - truth[n + k],
+                     dz = p[2 * n + k] - truth[2 * n + k];
+        gap[k] = sqrt(dx * dx + dy * dy + dz * dz);
+    }
+}
+
 /* Ages and errors in one table. */
 static void table_news(metrics *m, const dtsa_table *t, int64_t slot, const double *truth)
 {
     const int n = m->n, observer = t->observer;
     const int64_t weight = observer < 0 ? n - 1 : 1;
-    const uint8_t *ap = t->in_ap, *moving = m->moving;
     const int64_t *sent = t->sent_slot;
-    const double *p = t->est_p;
-    double errors = 0.0;
+    int64_t count = 0, sum = 0, oldest = slot;
+    double *gap = t->ages, errors = 0.0, worst = m->error_max;
+    gaps(n, t->est_p, truth, gap);
     for (int k = 0; k < n; k++) {
-        if (!moving[k] || !ap[k] || k == observer || sent[k] < 0) continue;
-        const int64_t age = slot - 1 - sent[k];
-        const double dx = p[k] - truth[k], dy = p[n + k] - truth[n + k],
-                     dz = p[2 * n + k] - truth[2 * n + k];
-        const double error = sqrt(dx * dx + dy * dy + dz * dz);
-        m->age_count += weight;
-        m->age_sum += weight * age;
-        if (age > m->age_max) m->age_max = age;
-        errors += error;
-        if (error > m->error_max) m->error_max = error;
+        if (!m->moving[k] || !t->in_ap[k] || k == observer || sent[k] < 0) continue;
+        count++;
+        sum += sent[k];
+        oldest = sent[k] < oldest ? sent[k] : oldest;
+        errors += gap[k];
+        worst = gap[k] > worst ? gap[k] : worst;
     }
+    m->age_count += weight * count;
+    m->age_sum += weight * (count * (slot - 1) - sum);
+    if (count && slot - 1 - oldest > m->age_max) m->age_max = slot - 1 - oldest;
+    m->error_max = worst;
     m->error_sum += errors * (double)weight;
 }
 
@@ -122,18 +133,22 @@ static void table_wakings(metrics *m, const dtsa_table *t, int64_t last)
     const int n = m->n, observer = t->observer;
     if (observer >= 0 && m->lost[observer]) return;
     const int64_t weight = observer < 0 ? n - 1 : 1;
+    int64_t count = 0, sum = 0, oldest = last;
     for (int k = 0; k < n; k++) {
         const int64_t woken = m->woken[k], sent = t->sent_slot[k];
         if (woken < 0 || !m->moving[k] || k == observer) continue;
-        const int64_t age = last - (sent >= woken ? sent : woken - 1);
-        m->waking_count += weight;
-        m->waking_sum += weight * age;
-        if (age > m->waking_max) m->waking_max = age;
+        const int64_t known = sent >= woken ? sent : woken - 1;
+        count++;
+        sum += known;
+        oldest = known < oldest ? known : oldest;
         if (sent < woken || m->heard[k]) continue;
         m->heard[k] = 1;
         const int64_t delay = last - woken;
         m->delays[delay < METRICS_DELAYS ? delay : METRICS_DELAYS - 1]++;
     }
+    m->waking_count += weight * count;
+    m->waking_sum += weight * (count * last - sum);
+    if (last - oldest > m->waking_max) m->waking_max = last - oldest;
 }
 
 static void wakings(metrics *m, const swarm *s, int64_t last, const double *now)

@@ -118,7 +118,7 @@ int sim_run(sim_flight *f, int64_t slots)
 {
     swarm *s = f->swarm;
     const int n = s->config.agents;
-    int end = METRICS_FLIES;
+    int end = METRICS_FLIES, estimated = 0;
     for (; slots > 0 && !end && !(f->log && sim_log_is_full(f->log, n)); slots--) {
         const int64_t slot = f->slot++;
         if (f->course) swarm_advance(s, f->course, slot);
@@ -132,7 +132,8 @@ int sim_run(sim_flight *f, int64_t slots)
             lose(&f->losses, n, slot, s->senders[0], f->received);
             received = f->received;
         }
-        swarm_complete(s, slot, outcome == SIM_SUCCESS, received);
+        swarm_complete(s, slot, estimated, outcome == SIM_SUCCESS, received);
+        estimated = slot + 1 >= f->metrics->news_from; /* by the metrics */
         f->metrics->frames += frames;
         end = metrics_update(f->metrics, slot, outcome);
         if (f->log) sim_log_close(f->log, s, slot, outcome, received);

@@ -281,17 +281,17 @@ void swarm_move(swarm *s, int step)
     memcpy(s->track + (long)step * 3 * count, s->position, sizeof(double) * 3 * (size_t)count);
 }
 
-void swarm_fly(swarm *s, int64_t slot)
+void swarm_fly(swarm *s, int64_t slot, int estimated)
 {
     for (int step = 0; step < s->config.steps; step++) {
-        swarm_steer(s, slot, step, 1);
+        swarm_steer(s, slot, step, step > 0 || !estimated);
         swarm_move(s, step);
     }
 }
 
-void swarm_complete(swarm *s, int64_t slot, int all, const uint8_t *heard)
+void swarm_complete(swarm *s, int64_t slot, int estimated, int all, const uint8_t *heard)
 {
-    swarm_fly(s, slot);
+    swarm_fly(s, slot, estimated);
     for (int i = 0; i < s->sender_count && (all || heard); i++) {
         const int l = s->senders[i];
         swarm_hear(s, slot, s->frames + (long)l * DTSA_FRAME_MAX, s->frame_length[l],

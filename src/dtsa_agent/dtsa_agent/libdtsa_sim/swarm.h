@@ -70,10 +70,11 @@ void swarm_estimate(swarm *s, int table, int64_t slot, int step);
 void swarm_estimate_all(swarm *s, int64_t slot, int step);
 void swarm_steer(swarm *s, int64_t slot, int step, int estimate);
 void swarm_move(swarm *s, int step);
-void swarm_fly(swarm *s, int64_t slot);
+/* estimated: the estimates of all tables are those for the start of the slot. */
+void swarm_fly(swarm *s, int64_t slot, int estimated);
 /* The rest of a slot whose frames are the swarm's own: fly, hear, end. heard (senders, v): which
  * tables hear each; NULL: `all` of them, or none. */
-void swarm_complete(swarm *s, int64_t slot, int all, const uint8_t *heard);
+void swarm_complete(swarm *s, int64_t slot, int estimated, int all, const uint8_t *heard);
 
 /* The only local agent of a swarm behind a station. */
 typedef struct swarm_pilot {

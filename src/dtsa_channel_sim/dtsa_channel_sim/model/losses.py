@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,13 +24,19 @@ Thresholds = Sequence[NDArray[np.uint64]]
 class NoiseSource:
     """The random numbers of a channel: the same for all settings that it goes through."""
 
-    __slots__ = ("factors", "state_factors", "state_words", "words")
-
     def __init__(self, seed: int, agents: int) -> None:
-        self.words = WordBlocks(seed, LOSS, agents)
-        self.factors = sender_factors(seed, LOSS, agents)
-        self.state_words = WordBlocks(seed, STATE, agents)
-        self.state_factors = sender_factors(seed, STATE, agents)
+        self.words, self.state_words = WordBlocks(seed, LOSS, agents), WordBlocks(seed, STATE, agents)
+        self._seed, self._agents = seed, agents
+
+    @cached_property
+    def factors(self) -> list[np.uint64]:
+        """Constants of senders, by id."""
+        return sender_factors(self._seed, LOSS, self._agents)
+
+    @cached_property
+    def state_factors(self) -> list[np.uint64]:
+        """The same for the words of bursts."""
+        return sender_factors(self._seed, STATE, self._agents)
 
 
 class Losses:

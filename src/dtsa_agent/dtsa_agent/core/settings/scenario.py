@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ def generator(seed: int, stream: int, *more: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream, *more])))
 
 
+@lru_cache(maxsize=64)  # a sweep flies the same seeds again with other settings
 def policy_key(seed: int) -> int:
     """By which policies draw lots, 63 bits."""
     return int(generator(seed, STREAM_POLICY).integers(0, 2**63))
