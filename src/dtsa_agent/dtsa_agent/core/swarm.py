@@ -259,6 +259,16 @@ class Swarm:
         """Fills ``estimate_position`` and ``estimate_velocity`` of all tables (eq:estimate); step: 0 .. steps."""
         lib.swarm_estimate_all(self.kernel, slot, self._instant(step))
 
+    def observations(self, slot: int, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
+        """What some local agents have heard before a slot, and their own states (docs/how-to/learning.md), (V, F)."""
+        end = len(self.ids) if end is None else end
+        if self.shared or not 0 <= first <= end <= len(self.ids):
+            raise ValueError("observations: of local agents with tables of their own")
+        own, planes = lib.SWARM_OBSERVED_OWN, lib.SWARM_OBSERVED_PLANES
+        observed = np.empty((end - first, own + planes * self.config.agents), dtype=np.float32)
+        lib.swarm_observe(self.kernel, slot, first, end, memory(observed, writable=True))
+        return observed
+
     def _instant(self, step: int, last: bool = True) -> int:
         if not 0 <= step < self.config.steps + last:
             raise ValueError(f"step: got {step}")

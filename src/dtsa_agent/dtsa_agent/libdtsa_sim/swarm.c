@@ -6,6 +6,7 @@
  */
 #include "swarm.h"
 
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -346,4 +347,48 @@ dtsa_station_agent swarm_station_agent(swarm_pilot *pilot)
 {
     return (dtsa_station_agent){pilot,       pilot_open,    pilot_hear,  pilot_unsent,
                                 pilot_close, pilot_restart, pilot_leave, pilot_on_probation};
+}
+
+/* ---- learning ---- */
+
+static void observe(const swarm *s, int l, int64_t slot, float *out)
+{
+    const dtsa_table *t = &s->tables[l];
+    const int n = s->config.agents, self = s->local[l];
+    float *planes = out + SWARM_OBSERVED_OWN;
+    double position[3], velocity[3], goal[3], away2 = 0.0;
+    int frame = 0;
+    take_vector(s, s->position, l, position);
+    take_vector(s, s->velocity, l, velocity);
+    take_vector(s, s->goal, l, goal);
+    for (int j = 0; j < n; j++) {
+        const int k = (self + j) % n;
+        const int64_t sent = t->sent_slot[k], ago = sent < 0 ? 0 : slot - sent;
+        const double since = (double)ago * s->config.slot_s;
+        frame |= slot > 0 && sent == slot - 1;
+        planes[j] = (float)(ago - 1);
+        planes[n + j] = (float)(slot - 1 - t->last[k]);
+        planes[2 * n + j] = (float)t->in_ap[k];
+        for (int i = 0; i < 3; i++) {
+            const double p = t->sent_p[i * n + k], v = t->sent_v[i * n + k];
+            planes[(3 + i) * n + j] = (float)(p + v * since - position[i]);
+            planes[(6 + i) * n + j] = (float)(v - velocity[i]);
+        }
+    }
+    for (int i = 0; i < 3; i++) {
+        const double way = goal[i] - position[i];
+        away2 += way * way;
+        out[4 + i] = (float)way;
+        out[7 + i] = (float)velocity[i];
+    }
+    out[0] = (float)slot;
+    out[1] = (float)((self + n - slot % n) % n);
+    out[2] = (float)frame;
+    out[3] = (float)(sqrt(away2) > s->config.r_min);
+}
+
+void swarm_observe(const swarm *s, int64_t slot, int first, int end, float *out)
+{
+    const long size = SWARM_OBSERVED_OWN + SWARM_OBSERVED_PLANES * (long)s->config.agents;
+    for (int l = first; l < end; l++) observe(s, l, slot, out + (l - first) * size);
 }

@@ -87,4 +87,10 @@ typedef struct swarm_pilot {
 /* Its pilot is the context, and has to stay. */
 dtsa_station_agent swarm_station_agent(swarm_pilot *pilot);
 
+/* What local agents with tables of their own, from `first` up to `end`, have heard before a slot,
+ * as numbers for learning. Of each: SWARM_OBSERVED_OWN, and SWARM_OBSERVED_PLANES of n, itself first
+ * and those with the next ids. */
+enum { SWARM_OBSERVED_OWN = 10, SWARM_OBSERVED_PLANES = 9 };
+void swarm_observe(const swarm *s, int64_t slot, int first, int end, float *out);
+
 #endif
