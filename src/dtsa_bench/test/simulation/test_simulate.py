@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core import REASONS
+from dtsa_agent.core.frame import decode_frame
 from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.recordings.verify import verify_bag
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import Flight, may_share, simulate
+from dtsa_channel_sim import Channel
 
 
 def run(**settings: Any) -> RunConfig:
@@ -89,6 +91,61 @@ def test_the_summary_says_what_the_tracks_say() -> None:
     assert summary["completion_time_s"] == pytest.approx((np.argmax(near) + 1) * 0.03)
     assert summary["flight_time_s"] == pytest.approx(summary["completion_time_s"] + 1.0, abs=0.03)
     assert (positions[:, :, ~moving] == flight.scenario.start[:, ~moving]).all()
+
+
+LINKS = [[0.0, 0.5, 0.1, 0.0], [0.1, 0.0, 0.1, 0.3], [0.2, 0.0, 0.0, 1.0], [0.0, 0.2, 0.4, 0.0]]
+MEASURED = {
+    "slot_ns": 0, "enter": [[0.1] * 4] * 4, "leave": [[0.2, 0.3, 0.4, 0.5]] * 4, "loss_good": LINKS,
+    "loss_bad": [[0.9] * 4] * 4,
+}  # fmt: skip
+BURSTS = {"loss": 0.2, "burst_length": 4.0}
+
+
+@pytest.mark.parametrize("more", [
+    {}, {"loss": 0.2, "slot_ms": 30.0}, BURSTS, {**BURSTS, "burst_scope": "link"},
+    {**BURSTS, "p_good": 0.05, "p_bad": 0.8}, {**BURSTS, "loss_matrix": LINKS}, {"losses": MEASURED},
+    {"link_loss": [{"from": 1, "to": 2, "loss": 0.7}], "estimator": "oracle"}, {"jam": True}, {"range_m": 3.0},
+    {"scenario": "waypoints", "r_min": 1.5, "loss": 0.1}, {"scenario": "staggered", "stagger_slots": 20},
+    {"schedule": [{"slot": 50, "loss": 0.4}, {"slot": 90, "jam": True, "until": 110}], **BURSTS},
+    {**BURSTS, "burst_scope": "link", "agents": 12, "timeout_s": 60.0, "tail_s": 57.0},
+], ids=str)  # fmt: skip
+@pytest.mark.parametrize("policy", ["dtsa", "aloha", "lease"])
+def test_flights_that_c_flies_are_those_that_python_steps_through(
+    policy: str, more: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The losses of whole flights are stated in C beside the channel's; the last is longer than a block of these."""
+    config = run(**{"agents": 4, "policy": policy, "timeout_s": 2.0, "stop_on_crash": False, **more})
+    whole = simulate(config, log=True, frames=True, observer=2)
+    monkeypatch.setattr(Channel, "lend_losses", lambda *_: 0)
+    stepped = simulate(config, log=True, frames=True, observer=2)
+    assert plain(whole) == plain(stepped) == plain(simulate(config))
+    for name, array in vars(whole.log).items():
+        assert array.tobytes() == getattr(stepped.log, name).tobytes(), name
+    log, slots = whole.log, len(whole.log)
+    assert slots == whole.metrics.slots == whole.summary()["slots"]["total"]
+    assert len(log.data) == len(log.received) == log.sent.sum()
+    slot, sender = np.nonzero(log.sent)
+    assert ((log.lost + log.collided)[slot, sender] <= config.swarm.agents - 1).all()
+    if not more.keys() & {"range_m"}:
+        reached = log.received.sum(axis=1) + log.lost[slot, sender] + log.collided[slot, sender]
+        assert (reached == config.swarm.agents - 1).all()
+    for data, at, agent in zip(log.data, slot.tolist(), sender.tolist(), strict=True):
+        frame = decode_frame(data.tobytes(), config.swarm.extent_m)
+        assert (frame.sender, frame.slot) == (agent + 1, at)
+        before = whole.scenario.start if not at else log.position[at - 1, -1]
+        assert np.abs(np.array(frame.position) - before[:, agent]).max() <= 0.0011
+
+
+def test_frames_in_a_log_are_signed_where_the_flight_has_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DTSA_AUTH_KEY", "00112233445566778899aabbccddeeff0123456789abcdef0123456789abcdef")
+    config = run(agents=4, policy="aloha", auth=True, auth_session=7, timeout_s=0.5)
+    flight = simulate(config, log=True, frames=True)
+    authenticator = flight.swarm.authenticator
+    for slot, data in zip(np.nonzero(flight.log.sent)[0].tolist(), flight.log.data, strict=True):
+        assert authenticator.open(data.tobytes(), slot)
+    without = simulate(run(agents=4, policy="aloha", timeout_s=0.5), log=True, frames=True)
+    assert np.array_equal(without.log.position, flight.log.position)
+    assert (flight.log.length.max(), without.log.length.max()) == (23, 19)
 
 
 def test_crashes_and_timeouts_end_flights_and_one_lost_frame_splits_the_views_of_dtsa() -> None:
