@@ -25,7 +25,10 @@ def _flights(table: SweepTable, spec: Spec) -> list[tuple[str, Flight]]:
     facets = table.levels(spec["facets"])
     groups = [table.where(**{spec["facets"]: facet})[0] for facet in facets]
     seed = table.sweep.seeds[0]
-    return [(str(facet), simulate(group.cell.run(seed), log=True)) for facet, group in zip(facets, groups, strict=True)]
+    return [
+        (str(facet), simulate(group.cell.run(seed), log=True, observer=1))
+        for facet, group in zip(facets, groups, strict=True)
+    ]
 
 
 def _movers(flight: Flight) -> NDArray[np.int64]:

@@ -196,7 +196,7 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         self.slot = 0  # the one that begins
         self.senders: tuple[int, ...] = ()  # ids, of the last slot
         self.outcome = 0  # of the last slot, index into OUTCOMES
-        self._channel = Channel(run.air)
+        self._channel, self._length = Channel(run.air), run.swarm.frame_length
         self.scenario.advance(0, self.swarm)
         self.agents = self.possible_agents[:]
         return self._observations(), {agent: {} for agent in self.agents}
@@ -220,7 +220,7 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         swarm.chosen[...] = np.where(sent, swarm.ids, 0)  # a silent agent says nothing of whom it takes for the sender
         senders, woken = swarm.emit(slot), self.metrics.woken.copy()
         self.metrics.compare_tables(slot, swarm.table_hash, swarm.chosen)
-        verdict, over = complete_slot(swarm, self._channel, self.metrics, slot, senders)
+        verdict, over = complete_slot(swarm, self._channel, self.metrics, slot, senders, self._length)
         self.slot, self.senders, self.outcome = slot + 1, verdict.senders, verdict.outcome
         known = np.maximum(swarm.sent_slot, woken - 1)  # of nobody since it has woken: the slot before
         ages = np.where(self.scenario.moving & (woken >= 0), slot - known, -1)

@@ -75,7 +75,7 @@ def simulate(
     shared_table: bool | None = None,
     log: bool = False,
     frames: bool = False,
-    observer: int = 1,
+    observer: int = 0,
 ) -> Flight:
     """Flies one run.
 
@@ -83,7 +83,7 @@ def simulate(
     :param shared_table: one table for all agents; None: where :func:`may_share` allows it.
     :param log: keep what happened in every slot.
     :param frames: keep the bytes of frames in it, too.
-    :param observer: id of the agent whose knowledge the log has.
+    :param observer: id of the agent whose knowledge the log has; 0: none.
     """
     begun = time.perf_counter()
     scenario = make_scenario(run.swarm)
@@ -98,14 +98,15 @@ def simulate(
 
 
 def complete_slot(
-    swarm: Swarm, channel: Channel, metrics: FlightMetrics, slot: int, senders: Sequence[int]
+    swarm: Swarm, channel: Channel, metrics: FlightMetrics, slot: int, senders: Sequence[int], length: int
 ) -> tuple[Verdict, str]:
     """Carry the frames of a slot, which are encoded already, and close it.
 
     :param senders: positions in ``ids`` of those that send.
+    :param length: bytes of each frame on the air.
     :returns: the channel's verdict, and why the flight is over now, or "".
     """
-    lengths = [swarm.config.frame_length] * len(senders)
+    lengths = [length] * len(senders)
     verdict = channel.arbitrate(slot, [swarm.ids[index] for index in senders], lengths, swarm.position)
     swarm.complete(slot, senders, verdict.received, verdict.outcome == SUCCESS)
     return verdict, metrics.update(slot, swarm.track, swarm, verdict.outcome, lengths)
@@ -120,7 +121,7 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
     metrics.follow(swarm.track, swarm)
     if swarm.course is None:
         swarm.scenario.advance(0, swarm)  # once and for all
-    whole, count, until = type(swarm) is Swarm, 256, 0
+    whole, length, count, until = type(swarm) is Swarm, swarm.config.frame_length, 1, 0
     while not metrics.end:
         slot = flight.slot
         if whole and slot >= until:
@@ -131,7 +132,7 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
             begun = time.perf_counter()
             lib.sim_run(flight, min(count, until - slot))
             spent = time.perf_counter() - begun
-            count = max(1, min(1 << 20, int((flight.slot - slot) * _CALL_S / max(spent, 1e-6))))
+            count = max(1, min(4 * count, int((flight.slot - slot) * _CALL_S / max(spent, 1e-6))))
         else:
             swarm.scenario.advance(slot, swarm)
             senders = swarm.begin(slot)
@@ -139,11 +140,11 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
                 metrics.compare_tables(slot, swarm.digest, swarm.chosen)
             if log is not None:
                 log.open_slot()
-            verdict, _ = complete_slot(swarm, channel, metrics, slot, senders)
+            verdict, _ = complete_slot(swarm, channel, metrics, slot, senders, length)
             if log is not None:
                 log.close_slot(slot, verdict)
             flight.slot = slot + 1
-    metrics.count_frames(swarm.config.frame_length, metrics.kernel.frames)
+    metrics.count_frames(length, metrics.kernel.frames)
 
 
 def _fly_unslotted(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None) -> None:

@@ -18,10 +18,11 @@ Bools = NDArray[np.bool_]
 
 _CAPACITY = 1024  # slots to begin with
 _OF_FRAMES = ("received", "data")
+_OF_OBSERVER = ("heard_slot", "heard_position", "estimate", "in_ap")
 
 
 class SlotArrays:
-    """A row a slot; agents by index (id - 1). Vectors are m and m/s, frame map.
+    """A row a slot; agents by index (id - 1). Vectors are m and m/s, frame map. What was not asked for has no rows.
 
     Where agents send at any instant ``received``, ``lost`` and ``collided`` are zero: frames arrive in other slots.
     """
@@ -44,7 +45,7 @@ class SlotArrays:
     estimate: Annotated[Floats, "3n"]  # for the start of the next slot
     in_ap: Annotated[Bytes, "n"]
     received: Annotated[Bools, "n"]  # (F, N) who received each frame, in the order of ``sent.nonzero()``
-    data: Annotated[Bytes, "b"]  # (F, B) its bytes; (0, B) unless they were asked for
+    data: Annotated[Bytes, "b"]  # (F, B) its bytes
 
     def __len__(self) -> int:
         return len(self.outcome)
@@ -69,7 +70,7 @@ class SlotWriter:
     """Memory that grows with a flight.
 
     :param swarm: all agents.
-    :param observer: id of the agent whose knowledge is kept.
+    :param observer: id of the agent whose knowledge is kept; 0: none.
     :param frames: keep the bytes of frames.
     """
 
@@ -79,6 +80,8 @@ class SlotWriter:
         sizes = {"n": config.agents, "k": config.steps, "b": config.frame_length, "3": 3}
         self.kernel = ffi.new("sim_log *", {"observer": observer - 1, "frame_bytes": config.frame_length})
         self._lent: dict[str, Any] = {}
+        left_out = {*(() if frames else ("data",)), *(() if observer else _OF_OBSERVER)}
+        self._kept = [name for name in _SHAPES if name not in left_out]
         for name, letters in _SHAPES.items():
             setattr(self._arrays, name, np.empty((0, *(sizes[letter] for letter in letters)), _ITEMS[name]))
         self._grow(_CAPACITY, _CAPACITY + config.agents)
@@ -92,7 +95,7 @@ class SlotWriter:
     def _grow(self, slots: int, frames: int) -> None:
         log = self.kernel
         log.capacity, log.frame_capacity = slots, frames
-        for name in _SHAPES if self._frames else _SHAPES.keys() - {"data"}:
+        for name in self._kept:
             old, of_frames = getattr(self._arrays, name), name in _OF_FRAMES
             rows = log.frames if of_frames else log.rows
             array = np.empty((frames if of_frames else slots, *old.shape[1:]), old.dtype)
@@ -123,10 +126,9 @@ class SlotWriter:
         """Return what was written; the room that was not needed is given back."""
         log, arrays, swarm = self.kernel, self._arrays, self._swarm
         self._lent.clear()
-        for name in _SHAPES:
+        for name in self._kept:
             array = getattr(arrays, name)
-            rows = log.frames if name in _OF_FRAMES else log.rows
-            array.resize((min(rows, len(array)), *array.shape[1:]), refcheck=False)
+            array.resize((log.frames if name in _OF_FRAMES else log.rows, *array.shape[1:]), refcheck=False)
         arrays.sent, arrays.received = arrays.sent.view(np.bool_), arrays.received.view(np.bool_)
         if self._frames and swarm.authenticator is not None and type(swarm) is Swarm:  # C does not sign
             for row, slot in zip(arrays.data, np.nonzero(arrays.sent)[0].tolist(), strict=True):

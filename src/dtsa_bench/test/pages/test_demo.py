@@ -31,7 +31,7 @@ def flights() -> dict[str, FinishedFlight]:
     """The flights of the demo without nodes: in lockstep they are the same, bit for bit."""
     found = {}
     for flight in (flight for step in STEPS for flight in step if not flight.live):
-        flown = simulate(flight.run, log=True)
+        flown = simulate(flight.run, log=True, observer=1)
         assert flown.log is not None
         track = flown.log.positions()[flight.run.swarm.steps - 1 :: flight.run.swarm.steps]
         position = np.concatenate((flown.scenario.start[None], track))

@@ -41,7 +41,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def flight(**settings: Any) -> Any:
-    return simulate(spec.run_config({"agents": 6, "seed": 5, "timeout_s": 1.5, **settings}), log=True)
+    return simulate(spec.run_config({"agents": 6, "seed": 5, "timeout_s": 1.5, **settings}), log=True, observer=1)
 
 
 def test_a_policy_of_ones_own_decides_who_sends() -> None:

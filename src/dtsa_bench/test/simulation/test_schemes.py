@@ -115,7 +115,7 @@ def delivered(share: float, loss: float, agents: int = 12) -> float:
         "policy": "mixer", "agents": agents, "avoider": "none", "loss": loss, "seed": 3, "timeout_s": 8, "tail_s": 9,
         "stop_on_crash": False, "options": {"mixer.slots_per_agent": share},
     })  # fmt: skip
-    log = simulate(run, log=True).log
+    log = simulate(run, log=True, observer=1).log
     period = round(share * agents)
     ends = log.heard_slot[2 * period - 2 :: period, 1:]
     return float((ends == period * np.arange(1, len(ends) + 1)[:, None]).mean())

@@ -23,7 +23,7 @@ def run(**settings: Any) -> RunConfig:
 
 
 def fly(**settings: Any) -> Flight:
-    return simulate(run(**settings), log=True)
+    return simulate(run(**settings), log=True, observer=1)
 
 
 def plain(flight: Flight) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def plain(flight: Flight) -> dict[str, Any]:
 def test_without_loss_one_table_for_all_makes_no_difference(policy: str, more: dict[str, Any]) -> None:
     config = run(agents=9, policy=policy, timeout_s=2.0, **{"moving": 8, **more})
     assert may_share(config)
-    one, many = (simulate(config, shared_table=shared, log=True) for shared in (True, False))
+    one, many = (simulate(config, shared_table=shared, log=True, observer=1) for shared in (True, False))
     assert one.swarm.sent_slot.shape[0] == 1
     assert many.swarm.sent_slot.shape[0] == 9
     assert one.log.senders() == many.log.senders()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ class Table:
     """
 
     def __init__(self, swarm: Swarm, row: int) -> None:
-        self._swarm, self._row = swarm, row
+        self._swarm, self._row = weakref.proxy(swarm), row  # a swarm has its tables: no cycle
         self.agent = int(swarm.observer[row]) + 1  # id of the observer, 0: one that hears everything
         self.config = swarm.config
         self.scenario = swarm.scenario
@@ -39,7 +40,8 @@ class Table:
 
         :raises ValueError: for the table of an agent that is elsewhere.
         """
-        return self._swarm.observations(slot, self._row, self._row + 1)[0]
+        observed: NDArray[np.float32] = self._swarm.observations(slot, self._row, self._row + 1)[0]
+        return observed
 
 
 def _window(array: NDArray[Any]) -> NDArray[Any]:
