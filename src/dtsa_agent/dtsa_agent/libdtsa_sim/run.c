@@ -114,7 +114,7 @@ void sim_log_close(sim_log *log, swarm *s, int64_t slot, int outcome, const uint
 
 /* ---- flights ---- */
 
-int sim_run(sim_flight *f, int64_t slots)
+int dtsa_sim_run(sim_flight *f, int64_t slots)
 {
     swarm *s = f->swarm;
     const int n = s->config.agents;

@@ -51,7 +51,7 @@ typedef struct sim_flight {
 } sim_flight;
 
 /* Flies some slots, fewer if the flight is over or its log is full. -> METRICS_, why it is over. */
-int sim_run(sim_flight *f, int64_t slots);
+int dtsa_sim_run(sim_flight *f, int64_t slots);
 int sim_log_is_full(const sim_log *log, int n);
 /* All have decided, and their frames are encoded. */
 void sim_log_open(sim_log *log, const swarm *s);

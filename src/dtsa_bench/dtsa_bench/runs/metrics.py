@@ -124,6 +124,8 @@ class FlightMetrics:
         :param lengths: bytes of each frame that was sent in it, whether or not anybody received it.
         :returns: why the flight is over now, or "" if it goes on.
         """
+        if outcome not in (IDLE, SUCCESS, COLLISION):
+            raise ValueError(f"outcome: got {outcome}")
         for length in lengths:
             self._frames[length] += 1
         if self._torn_ways:
@@ -132,11 +134,11 @@ class FlightMetrics:
                 track[:, :, agent - 1] = self._last[:, agent - 1]
             self.kernel.waits = not self._others_arrived(track[-1])
         if track is not self._seen[0] or tables is not self._seen[1]:  # mostly they are the same again
-            self.follow(track, tables)
+            self.use_arrays(track, tables)
         return ENDS[_update(self.kernel, slot, outcome)]
 
-    def follow(self, track: Array, tables: Swarm | None) -> None:
-        """Look at these arrays from the next slot on; parameters are those of :meth:`update`."""
+    def use_arrays(self, track: Array, tables: Swarm | None) -> None:
+        """Read these arrays from the next slot on; parameters are those of :meth:`update`."""
         if track.shape[1:] != (3, len(self._moving)):
             raise ValueError(f"track: shape {track.shape}")
         self._seen, self._track = (track, tables), memory(track)

@@ -118,19 +118,19 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
     flight.swarm, flight.metrics, flight.received = swarm.kernel, metrics.kernel, received
     flight.course = ffi.NULL if swarm.course is None else swarm.course.kernel
     flight.log = ffi.NULL if log is None else log.kernel
-    metrics.follow(swarm.track, swarm)
+    metrics.use_arrays(swarm.track, swarm)
     if swarm.course is None:
         swarm.scenario.advance(0, swarm)  # once and for all
     whole, length, count, until = type(swarm) is Swarm, swarm.config.frame_length, 1, 0
     while not metrics.end:
         slot = flight.slot
         if whole and slot >= until:
-            until = channel.lend_losses(slot, flight.losses)
+            until = channel.fill_losses(slot, flight.losses)
         if slot < until:
             if log is not None:
                 log.make_room()
             begun = time.perf_counter()
-            lib.sim_run(flight, min(count, until - slot))
+            lib.dtsa_sim_run(flight, min(count, until - slot))
             spent = time.perf_counter() - begun
             count = max(1, min(4 * count, int((flight.slot - slot) * _CALL_S / max(spent, 1e-6))))
         else:

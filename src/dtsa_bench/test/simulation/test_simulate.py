@@ -116,7 +116,7 @@ def test_flights_that_c_flies_are_those_that_python_steps_through(
     """The losses of whole flights are stated in C beside the channel's; the last is longer than a block of these."""
     config = run(**{"agents": 4, "policy": policy, "timeout_s": 2.0, "stop_on_crash": False, **more})
     whole = simulate(config, log=True, frames=True, observer=2)
-    monkeypatch.setattr(Channel, "lend_losses", lambda *_: 0)
+    monkeypatch.setattr(Channel, "fill_losses", lambda *_: 0)
     stepped = simulate(config, log=True, frames=True, observer=2)
     assert plain(whole) == plain(stepped) == plain(simulate(config))
     for name, array in vars(whole.log).items():

@@ -109,15 +109,15 @@ class Channel:
             self._use(slot)
         return self._medium
 
-    def lend_losses(self, slot: int, losses: Any) -> int:
-        """Hand C what a frame loses that is alone in its slot.
+    def fill_losses(self, slot: int, losses: Any) -> int:
+        """Tell C which receivers lose a frame that is alone in its slot.
 
-        :param losses: a ``sim_losses`` (``libdtsa_sim/run.h``).
+        :param losses: a ``sim_losses`` (``libdtsa_sim/run.h``), which is filled in.
         :returns: the slot up to which that holds; 0: :meth:`arbitrate` has to say what becomes of this slot's frames.
         """
         if not self._first <= slot < self._end:
             self._use(slot)
-        return min(self._end, self._losses.lend(slot, losses)) if self._simple else 0
+        return min(self._end, self._losses.fill(slot, losses)) if self._simple else 0
 
     def _use(self, slot: int) -> None:
         """Make the settings of a slot the present ones."""

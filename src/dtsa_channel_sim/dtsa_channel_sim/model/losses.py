@@ -82,7 +82,7 @@ class Losses:
         words = self._source.words.row(slot) * self._source.factors[sender]
         return words < np.where(bad, self._bad[sender], self._good[sender])
 
-    def lend(self, slot: int, losses: Any) -> int:
+    def fill(self, slot: int, losses: Any) -> int:
         """Fill a ``sim_losses`` from a slot on; return the slot up to which it holds."""
         losses.none, losses.chains = self.none, 0
         if self.none:
