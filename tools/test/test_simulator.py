@@ -13,7 +13,7 @@ from dtsa_dev.proofs.library import LIBRARY, NotHere, compile_program, sources, 
 
 import dtsa_agent
 
-SIMULATOR = LIBRARY.parent / "libdtsa_sim"
+SIMULATOR, SOCKETS = LIBRARY.parent / "libdtsa_sim", LIBRARY.parent / "air" / "udp"
 BINDING = Path(dtsa_agent.__file__).resolve().parents[1] / "build" / "binding" / "_kernel.c"
 FLAGS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-shared", "-fPIC")
 FLIGHTS = """
@@ -57,9 +57,9 @@ def test_flights_touch_nothing_that_is_not_theirs(tmp_path: Path) -> None:
         pytest.skip(str(error))
     if not BINDING.exists():
         pytest.skip(f"no {BINDING}: the binding was compiled elsewhere")
-    paths = (sysconfig.get_paths()["include"], LIBRARY / "avoider", SIMULATOR)
+    paths = (sysconfig.get_paths()["include"], LIBRARY / "avoider", SIMULATOR, SOCKETS)
     flags = (*FLAGS, "-DPy_LIMITED_API=0x030a0000", *(f"-I{path}" for path in paths))
-    files = [BINDING, *sources(), *sorted(SIMULATOR.glob("*.c"))]
+    files = [BINDING, *sources(), *sorted(SIMULATOR.glob("*.c")), *sorted(SOCKETS.glob("*.c"))]
     kernel = compile_program(gcc, tmp_path / "_kernel.so", files, flags)
     preload = subprocess.run([gcc, "-print-file-name=libasan.so"], capture_output=True, text=True, check=True)
     environment = {**os.environ, "LD_PRELOAD": preload.stdout.strip(), "ASAN_OPTIONS": "detect_leaks=0"}

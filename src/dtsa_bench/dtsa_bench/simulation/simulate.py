@@ -121,7 +121,7 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
     metrics.use_arrays(swarm.track, swarm)
     if swarm.course is None:
         swarm.scenario.advance(0, swarm)  # once and for all
-    whole, length, count, until = type(swarm) is Swarm, swarm.config.frame_length, 1, 0
+    whole, length, count, until = swarm.all_in_c, swarm.config.frame_length, 1, 0
     while not metrics.end:
         slot = flight.slot
         if whole and slot >= until:

@@ -130,7 +130,7 @@ class SlotWriter:
             array = getattr(arrays, name)
             array.resize((log.frames if name in _OF_FRAMES else log.rows, *array.shape[1:]), refcheck=False)
         arrays.sent, arrays.received = arrays.sent.view(np.bool_), arrays.received.view(np.bool_)
-        if self._frames and swarm.authenticator is not None and type(swarm) is Swarm:  # C does not sign
+        if self._frames and swarm.authenticator is not None and swarm.all_in_c:  # C does not sign
             for row, slot in zip(arrays.data, np.nonzero(arrays.sent)[0].tolist(), strict=True):
                 signed = swarm.authenticator.seal(row[:-TAG_LENGTH].tobytes(), slot)
                 row[:] = np.frombuffer(signed, np.uint8)
