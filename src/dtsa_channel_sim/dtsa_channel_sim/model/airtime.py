@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from dtsa_agent.air.serial.lengths import FRAMING
 from dtsa_agent.air.serial.modems import MODEMS, NONE, Modem
@@ -144,4 +145,9 @@ def airtime_of(radio: str, bitrate: int, ramp_up_ns: int, link_delay_ns: int) ->
     if not row.tuned:
         return row.airtime
     line = Line(link_delay_ns, 0, link_delay_ns, 0) if radio == "plain" else row.airtime.line
-    return replace(row.airtime, bitrate=bitrate, ramp_up_ns=ramp_up_ns, line=line)
+    return _tuned(row.airtime, bitrate, ramp_up_ns, line)
+
+
+@lru_cache(maxsize=64)  # each flight asks several times
+def _tuned(airtime: Airtime, bitrate: int, ramp_up_ns: int, line: Line) -> Airtime:
+    return replace(airtime, bitrate=bitrate, ramp_up_ns=ramp_up_ns, line=line)

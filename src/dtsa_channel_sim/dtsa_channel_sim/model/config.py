@@ -183,6 +183,8 @@ class ChannelConfig(Settings):
 
         :raises ConfigError: when a setting cannot change in flight or its value is not allowed.
         """
+        if not (values or self.schedule):
+            return self
         for name in values:
             if name not in CHANGEABLE:
                 raise ConfigError(str(name), values[name], f"a setting that may change: {', '.join(CHANGEABLE)}")
