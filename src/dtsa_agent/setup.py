@@ -29,7 +29,7 @@ LIBRARY, SIMULATOR, SOCKETS = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "d
 HEADERS = [
     f"{LIBRARY}/{name}.h" for name in ("include/dtsa", "include/dtsa_station", "frame", "core", "avoider/avoider")
 ]
-HEADERS += [f"{SIMULATOR}/{name}.h" for name in ("vehicle", "swarm", "metrics", "live")]
+HEADERS += [f"{SIMULATOR}/{name}.h" for name in ("vehicle", "course", "swarm", "metrics", "run", "live")]
 HEADERS += [f"{SOCKETS}/socket_reader.h"]
 # What C calls in Python: an agent behind a station, and what is told of it (core/station.py).
 CALLBACKS = "dtsa_agent/core/callbacks.h"

@@ -11,8 +11,6 @@ import io
 import json
 from pathlib import Path
 
-import numpy as np
-
 import dtsa
 from dtsa_agent.core.registry import POLICIES
 from dtsa_bench.commands.cli import main
@@ -48,10 +46,10 @@ def digest() -> str:
     """Of everything that happens in flights of each policy: positions, senders, outcomes, choices, priorities."""
     whole = hashlib.sha256()
     for settings in ({"policy": policy, **setting} for policy in POLICIES.names for setting in (PLAIN, LOSSY)):
-        trace = simulate(run_config(settings), trace=True).trace
-        assert trace is not None
-        whole.update(trace.positions().tobytes() + np.array(trace.scores).tobytes())
-        whole.update(json.dumps([trace.senders, trace.outcomes, trace.chosen]).encode())
+        log = simulate(run_config(settings), log=True).log
+        assert log is not None
+        whole.update(log.position.tobytes() + log.score.tobytes() + log.outcome.tobytes() + log.chosen.tobytes())
+        whole.update(json.dumps(log.senders()).encode())
     return whole.hexdigest()[:16]
 
 

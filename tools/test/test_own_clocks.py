@@ -18,7 +18,7 @@ from dtsa_dev.protocol.experiment import FAR, still_scenario
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.station import Link, Station, StationSettings
 from dtsa_channel_sim import Air, Channel, ChannelConfig
-from dtsa_channel_sim.model.clocks import AgentClock, ClockConfig, make_clocks
+from dtsa_channel_sim.model.config import AgentClock, ClockConfig, make_clocks
 
 S = 1_000_000_000
 TRUST_NS = 1_000_000

@@ -99,7 +99,7 @@ class TrackedFleet(Fleet):
     def __init__(self, config: FleetConfig) -> None:
         self._unseen: set[int] = set()
         self._noise = np.random.default_rng(config.count)
-        limit_to_machine(os.environ, shared_memory=False)
+        limit_to_machine(os.environ)
         init_ros(["--ros-args", "--disable-rosout-logs"])
         node = rclpy.create_node("motion_capture", enable_rosout=False, start_parameter_services=False)
         self._poses = [node.create_publisher(PoseStamped, f"/cf{k + 1}/pose", 1) for k in range(config.count)]

@@ -18,8 +18,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from waiting import wait_for
 
+from dtsa_agent.ros.common.process.loop import Serving
 from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.process.serving import Serving
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 from dtsa_bench.flights.domain import ros_domain
 
@@ -136,11 +136,8 @@ def graph_in(domain: int, logs: Path) -> Iterator[Graph]:
 
 
 def _made(domain: int, name: str) -> Node:
-    """A node in a context of its own.
-
-    Without shared memory: to end it beside what was killed may crash the middleware.
-    """
-    limit_to_machine(os.environ, shared_memory=False)
+    """A node in a context of its own."""
+    limit_to_machine(os.environ)
     context = Context()
     init_ros([], context, domain)
     return Node(name, context=context, enable_rosout=False, start_parameter_services=False)

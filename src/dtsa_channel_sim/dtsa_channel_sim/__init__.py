@@ -3,8 +3,7 @@
 from dtsa_channel_sim.model.air import Air, FrameVerdict
 from dtsa_channel_sim.model.airtime import Airtime
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.clocks import AgentClock, ClockConfig, make_clocks
-from dtsa_channel_sim.model.config import CHANGEABLE, Change, ChannelConfig
+from dtsa_channel_sim.model.config import CHANGEABLE, AgentClock, Change, ChannelConfig, ClockConfig, make_clocks
 from dtsa_channel_sim.model.measured import MeasuredLosses
 from dtsa_channel_sim.model.medium import Medium, OnAir, Reception
 from dtsa_channel_sim.model.topology import LinkLoss

@@ -17,14 +17,14 @@ from dtsa_msgs.msg import Report
 from rclpy.serialization import serialize_message
 
 from dtsa_agent.ros.common.wire.checks import Unusable
-from dtsa_agent.ros.common.wire.report_fields import ReportFields, read_report
-from dtsa_channel_sim.ros.accounts import Accounts, Delivered
+from dtsa_agent.ros.common.wire.messages import Fields, read_report
+from dtsa_channel_sim.ros.answers import Accounts, Delivered
 
 AGENTS, STEPS, LATEST = 5, 1, 50
 IDS, SLOTS = (2, 3), (7, 8)
 
 
-def report(**changed: Any) -> ReportFields:
+def report(**changed: Any) -> Fields:
     """A report of agents 2 and 3 on slots 7 and 8, in which each has taken in the frame of agent 1."""
     entries = len(IDS) * len(SLOTS)
     fields: dict[str, Any] = {

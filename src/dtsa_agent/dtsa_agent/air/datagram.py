@@ -37,57 +37,35 @@ _UNIT_NS = 10_000  # of times in the header
 
 
 def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
-    """From the order to send a frame to its arrival, as agents take it to be, ns.
-
-    :param config: what all agents share.
-    :param port: what carries the frames.
-    """
+    """From the order to send a frame to its arrival, as agents take it to be, ns."""
     length = port.header(config.auth).size + config.frame_length
     return port.flight_time_ns + port.byte_time_ns * length + port.turn_ns * config.agents // 2  # half a round
 
 
 def late_in(datagram: bytes, layout: Header) -> int:
-    """How much later than its slot a datagram says to have left, ns; 0 where it does not say.
-
-    :param datagram: the datagram.
-    :param layout: what stands before its frame.
-    """
+    """How much later than its slot a datagram says to have left, ns; 0 where it does not say."""
     return int.from_bytes(datagram[layout.agreed : layout.agreed + layout.late], "little") * _UNIT_NS
 
 
 def trust_ns(config: SwarmConfig, port: PortProperties) -> int:
-    """By how much a frame may be off its slot and still say what time it is, ns.
-
-    :param config: what all agents share.
-    :param port: what carries the frames.
-    """
+    """By how much a frame may be off its slot and still say what time it is, ns."""
     return config.slot_ns // 4 if port.varies else _TRUST_NS
 
 
 def shortest_slot_ns(config: SwarmConfig, port: PortProperties) -> int:
-    """The shortest slot that a port can carry, ns: a frame that waits for a whole round is there in time.
-
-    :param config: what all agents share.
-    :param port: what carries the frames.
-    """
+    """The shortest slot that a port can carry, ns: a frame that waits for a whole round is there in time."""
     longest = flight_ns(config, port) + port.turn_ns * config.agents // 2
     return max(port.shortest_slot_ns, round(longest / (1 - BETWEEN)) if port.slots_hold_flights else 0)
 
 
 def frame_in(datagram: bytes, config: SwarmConfig) -> bytes:
-    """The frame in a datagram of a swarm as the air carried it: sealed, if frames are; empty for no datagram.
-
-    :param datagram: the datagram.
-    :param config: what all agents share.
-    """
+    """The frame in a datagram of a swarm as the air carried it: sealed, if frames are; empty for no datagram."""
     return datagram[-config.frame_length :]
 
 
 def check_fits(config: SwarmConfig, port: PortProperties) -> None:
     """Refuses frames that are too long for a port, and slots that are too short.
 
-    :param config: what all agents share.
-    :param port: what is to carry them.
     :raises ConfigError: if they are.
     """
     shortest_ns = shortest_slot_ns(config, port)
@@ -111,11 +89,7 @@ def check_fits(config: SwarmConfig, port: PortProperties) -> None:
 
 
 def header_of(config: SwarmConfig, port: PortProperties = NETWORK) -> bytes:
-    """With which all datagrams of a swarm begin.
-
-    :param config: what all agents share.
-    :param port: what carries them.
-    """
+    """With which all datagrams of a swarm begin."""
     agreed = settings_hash(agreed_settings(config, port.name)).to_bytes(8, "little")
     count = port.header(config.auth).agreed
     return _MAGIC + agreed[:4] if count == _WITH_MAGIC else agreed[:count]

@@ -36,7 +36,6 @@ def _load(path: str) -> Any:
 def settings_class(air: str) -> Any:
     """The settings class of a kind of port; its objects are :class:`.port.PortSettings`.
 
-    :param air: the kind's name.
     :raises ConfigError: if there is none of this name.
     """
     if air not in _KINDS:
@@ -47,8 +46,6 @@ def settings_class(air: str) -> Any:
 def make_settings(air: str, values: dict[str, Any]) -> PortSettings:
     """The settings of a port.
 
-    :param air: name of its kind.
-    :param values: settings by name.
     :raises ConfigError: for a kind, a setting or a value that cannot be.
     """
     made: PortSettings = settings_class(air).from_dict(values)
@@ -58,7 +55,6 @@ def make_settings(air: str, values: dict[str, Any]) -> PortSettings:
 def open_port(settings: PortSettings) -> DatagramPort:
     """The port of an agent.
 
-    :param settings: of any kind.
     :raises ConfigError: if it cannot be used.
     """
     port: DatagramPort = _load(_KINDS[settings.properties.name].port)(settings)
@@ -68,7 +64,6 @@ def open_port(settings: PortSettings) -> DatagramPort:
 def open_listener(settings: PortSettings) -> Listener:
     """What hears a swarm and sends nothing.
 
-    :param settings: of any kind of port.
     :raises ConfigError: if it cannot be used.
     """
     listener: Listener = _load(_KINDS[settings.properties.name].listener)(settings)

@@ -51,11 +51,7 @@ class Tally:
         self._off.add(abs(off_ns))
 
     def summary(self, status: Any, longest_gap: tuple[int, int]) -> dict[str, Any]:
-        """The counts as plain values.
-
-        :param status: a ``dtsa_station_status``.
-        :param longest_gap: how long it has waited for an agent, slots, and for which.
-        """
+        """The counts as plain values."""
         used, ended = _processor_s(), self.ended_ns or time.monotonic_ns()
         late = status.unsent - self.unsent.total()
         unsent = self.unsent + Counter({TOO_LATE: max(0, late)})

@@ -26,7 +26,8 @@ NAMES: dict[str, tuple[str, ...]] = dict(map(_strings, takewhile(bool, map(lib.d
 
 # What C calls arrays, by the letters of their items in NumPy.
 _TYPES = {np.dtype(name).char: ffi.typeof(f"{name}_t[]") for name in ("int32", "int64", "uint16", "uint32", "uint64")}
-_TYPES |= {"d": ffi.typeof("double[]"), "B": ffi.typeof("uint8_t[]"), "?": ffi.typeof("uint8_t[]")}
+_TYPES |= {"d": ffi.typeof("double[]"), "f": ffi.typeof("float[]")}
+_TYPES |= {"B": ffi.typeof("uint8_t[]"), "?": ffi.typeof("uint8_t[]")}
 
 
 def memory(array: NDArray[Any], *, writable: bool = False) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
+from functools import lru_cache
 from typing import Annotated, Any, get_type_hints
 
 import numpy as np
@@ -30,6 +31,15 @@ _NULL = ffi.NULL
 _begin, _fly, _hear, _end, _complete = (  # once a slot
     lib.swarm_begin, lib.swarm_fly, lib.swarm_hear, lib.swarm_end, lib.swarm_complete,
 )  # fmt: skip
+
+
+@lru_cache(maxsize=16)
+def _decay(tau: float, step_s: float) -> Floats:
+    """Return how a vehicle approaches its command (``dtsa_decay``), read-only, (2, DECAY_STEPS)."""
+    decay = np.zeros((2, DECAY_STEPS))
+    lib.dtsa_decay(tau, step_s, DECAY_STEPS, memory(decay, writable=True))
+    decay.setflags(write=False)
+    return decay
 
 
 class SlotOutcome(IntEnum):
@@ -84,6 +94,7 @@ class Swarm:
     velocity: Annotated[Floats, "3l"]  # m/s
     command: Annotated[Floats, "3l"]  # m/s, commanded velocity
     goal: Annotated[Floats, "3l"]  # m, where each flies to now
+    known_goal: Annotated[Floats, "3n"]  # m, where all take those who rest
     track: Annotated[Floats, "s3l"]  # m, true positions at the control instants of the last slot
     active: Annotated[Bytes, "l"]  # 0: hovers, does not run its avoider
     final: Annotated[Bytes, "l"]  # no further goal is scheduled
@@ -121,12 +132,10 @@ class Swarm:
         count, steps = len(self.ids), config.steps
         model = flight_model(config.avoider, config.options)
         self._start = np.ascontiguousarray(self.scenario.start, dtype=np.float64)
-        self.known_goal = np.array(self.scenario.target, dtype=np.float64)  # (3, N) m, where all take those who rest
-        self._decay = np.zeros((2, DECAY_STEPS))
-        lib.dtsa_decay(model.vehicle.tau, config.slot_s / steps, DECAY_STEPS, memory(self._decay, writable=True))
+        self._decay = _decay(model.vehicle.tau, config.slot_s / steps)
         kernel = ffi.new("swarm *", {
             "config": self._protocol(model), "local_count": count, "table_count": len(tables), "shared": self.shared,
-            "vehicle": model.vehicle.to_dict(),
+            "vehicle": model.vehicle.to_dict(), "announce": config.announce, "goals_known": self.scenario.goals_known,
         })  # fmt: skip
         sizes = {
             "n": config.agents, "v": len(tables), "l": count, "s": steps, "f": FRAME_MAX,
@@ -134,6 +143,7 @@ class Swarm:
         }  # fmt: skip
         self._lend(kernel, sizes)
         self.local[:], self.observer[:], self.final[:] = np.array(self.ids) - 1, np.array(tables) - 1, 1
+        self.known_goal[:] = self.scenario.target
         self.rows = np.arange(count)  # (L,) table of each local agent, unless shared
         self.course: Course | None = self.scenario.course(self.local)  # where they are in the scenario's plan
         self.kernel = ffi.gc(kernel, lib.swarm_close)
@@ -168,7 +178,7 @@ class Swarm:
             profile=PROFILE_EXTENDED if config.extended else profile,
             targets_known=config.targets_known and self.scenario.goals_known,
             position_step=position_step(config.extent_m), key=policy_key(config.seed) if key is None else key,
-            avoid=model.avoider.to_dict(), lease=lease, start=memory(self._start), target=memory(self.known_goal),
+            avoid=model.avoider.to_dict(), lease=lease, start=memory(self._start),
             decay=memory(self._decay), decay_len=DECAY_STEPS,
         )  # fmt: skip
 
@@ -209,7 +219,7 @@ class Swarm:
             tables = _NULL if heard is None else heard.tobytes()
             if heard is not None and heard.shape != (len(senders), len(self.observer)):
                 raise ValueError(f"heard: shape {heard.shape}")
-            _complete(self.kernel, slot, all_hear, tables)
+            _complete(self.kernel, slot, 0, all_hear, tables)
             return
         frames = [self.frame(index) for index in senders]
         self.fly(slot)
@@ -235,7 +245,7 @@ class Swarm:
 
     def fly(self, slot: int) -> None:
         """Commands and motion of the local agents during a slot, :meth:`steer` and :meth:`move` at each instant."""
-        _fly(self.kernel, slot)
+        _fly(self.kernel, slot, 0)
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         """Fills ``command`` for one control instant, 0 .. steps; ``estimate``: whether to fill the estimates first."""
@@ -248,6 +258,16 @@ class Swarm:
     def estimate(self, slot: int, step: int = 0) -> None:
         """Fills ``estimate_position`` and ``estimate_velocity`` of all tables (eq:estimate); step: 0 .. steps."""
         lib.swarm_estimate_all(self.kernel, slot, self._instant(step))
+
+    def observations(self, slot: int, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
+        """What some local agents have heard before a slot, and their own states (docs/how-to/learning.md), (V, F)."""
+        end = len(self.ids) if end is None else end
+        if self.shared or not 0 <= first <= end <= len(self.ids):
+            raise ValueError("observations: of local agents with tables of their own")
+        own, planes = lib.SWARM_OBSERVED_OWN, lib.SWARM_OBSERVED_PLANES
+        observed = np.empty((end - first, own + planes * self.config.agents), dtype=np.float32)
+        lib.swarm_observe(self.kernel, slot, first, end, memory(observed, writable=True))
+        return observed
 
     def _instant(self, step: int, last: bool = True) -> int:
         if not 0 <= step < self.config.steps + last:
@@ -316,7 +336,6 @@ class Swarm:
         swarm.emit(slot)  # lists the senders of the present slot; what this encodes is written over below
         for name in _SHAPES.keys() - {"observer"}:
             getattr(swarm, name)[...] = getattr(self, name)  # the one table becomes everybody's
-        swarm.known_goal[...] = self.known_goal
         swarm.course, swarm.authenticator = self.course, self.authenticator
         return swarm
 

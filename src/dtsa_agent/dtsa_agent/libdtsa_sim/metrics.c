@@ -44,18 +44,17 @@ static int nearest_index(int from, int n, const double *x, const double *y, cons
 static int distances(metrics *m, int64_t slot)
 {
     const int n = m->n;
-    metrics_sums *sum = m->sums;
     int crashed = 0;
     for (int step = 0; step < m->steps; step++) {
         const double *x = m->track + (long)step * 3 * n, *y = x + n, *z = y + n;
         for (int k = 0; k < n - 1; k++) {
             const double d2 =
                 nearest2(n - k - 1, x + k + 1, y + k + 1, z + k + 1, x[k], y[k], z[k]);
-            if (d2 < sum->min_distance2) {
-                sum->min_distance2 = d2;
-                sum->pair_1 = k + 1;
-                sum->pair_2 = nearest_index(k + 1, n, x, y, z, k) + 1;
-                sum->min_slot = slot;
+            if (d2 < m->min_distance2) {
+                m->min_distance2 = d2;
+                m->pair_1 = k + 1;
+                m->pair_2 = nearest_index(k + 1, n, x, y, z, k) + 1;
+                m->min_slot = slot;
             }
             if (d2 < m->collision_m * m->collision_m) crashed = 1;
         }
@@ -85,29 +84,39 @@ static int arrived(const metrics *m, const double *now)
     return 1;
 }
 
+DTSA_SIMD
+static void gaps(int n, const double *restrict p, const double *restrict truth,
+                 double *restrict gap)
+{
+    for (int k = 0; k < n; k++) {
+        const double dx = p[k] - truth[k], dy = p[n + k] - truth[n + k],
+                     dz = p[2 * n + k] - truth[2 * n + k];
+        gap[k] = sqrt(dx * dx + dy * dy + dz * dz);
+    }
+}
+
 /* Ages and errors in one table. */
 static void table_news(metrics *m, const dtsa_table *t, int64_t slot, const double *truth)
 {
     const int n = m->n, observer = t->observer;
     const int64_t weight = observer < 0 ? n - 1 : 1;
-    const uint8_t *ap = t->in_ap, *moving = m->moving;
     const int64_t *sent = t->sent_slot;
-    const double *p = t->est_p;
-    metrics_sums *sum = m->sums;
-    double errors = 0.0;
+    int64_t count = 0, sum = 0, oldest = slot;
+    double *gap = t->ages, errors = 0.0, worst = m->error_max;
+    gaps(n, t->est_p, truth, gap);
     for (int k = 0; k < n; k++) {
-        if (!moving[k] || !ap[k] || k == observer || sent[k] < 0) continue;
-        const int64_t age = slot - 1 - sent[k];
-        const double dx = p[k] - truth[k], dy = p[n + k] - truth[n + k],
-                     dz = p[2 * n + k] - truth[2 * n + k];
-        const double error = sqrt(dx * dx + dy * dy + dz * dz);
-        sum->age_count += weight;
-        sum->age_sum += weight * age;
-        if (age > sum->age_max) sum->age_max = age;
-        errors += error;
-        if (error > sum->error_max) sum->error_max = error;
+        if (!m->moving[k] || !t->in_ap[k] || k == observer || sent[k] < 0) continue;
+        count++;
+        sum += sent[k];
+        oldest = sent[k] < oldest ? sent[k] : oldest;
+        errors += gap[k];
+        worst = gap[k] > worst ? gap[k] : worst;
     }
-    sum->error_sum += errors * (double)weight;
+    m->age_count += weight * count;
+    m->age_sum += weight * (count * (slot - 1) - sum);
+    if (count && slot - 1 - oldest > m->age_max) m->age_max = slot - 1 - oldest;
+    m->error_max = worst;
+    m->error_sum += errors * (double)weight;
 }
 
 static void news(metrics *m, swarm *s, int64_t slot, const double *truth)
@@ -122,21 +131,24 @@ static void news(metrics *m, swarm *s, int64_t slot, const double *truth)
 static void table_wakings(metrics *m, const dtsa_table *t, int64_t last)
 {
     const int n = m->n, observer = t->observer;
-    if (observer >= 0 && m->gone[observer]) return;
+    if (observer >= 0 && m->lost[observer]) return;
     const int64_t weight = observer < 0 ? n - 1 : 1;
-    metrics_sums *sum = m->sums;
+    int64_t count = 0, sum = 0, oldest = last;
     for (int k = 0; k < n; k++) {
         const int64_t woken = m->woken[k], sent = t->sent_slot[k];
         if (woken < 0 || !m->moving[k] || k == observer) continue;
-        const int64_t age = last - (sent >= woken ? sent : woken - 1);
-        sum->waking_count += weight;
-        sum->waking_sum += weight * age;
-        if (age > sum->waking_max) sum->waking_max = age;
+        const int64_t known = sent >= woken ? sent : woken - 1;
+        count++;
+        sum += known;
+        oldest = known < oldest ? known : oldest;
         if (sent < woken || m->heard[k]) continue;
         m->heard[k] = 1;
         const int64_t delay = last - woken;
         m->delays[delay < METRICS_DELAYS ? delay : METRICS_DELAYS - 1]++;
     }
+    m->waking_count += weight * count;
+    m->waking_sum += weight * (count * last - sum);
+    if (last - oldest > m->waking_max) m->waking_max = last - oldest;
 }
 
 static void wakings(metrics *m, const swarm *s, int64_t last, const double *now)
@@ -151,12 +163,80 @@ static void wakings(metrics *m, const swarm *s, int64_t last, const double *now)
     }
 }
 
-int metrics_update(metrics *m, int64_t slot)
+/* Agents that get a goal as a slot begins. One that has flown through a goal without a rest has been
+ * flying all the time. */
+static void wake(metrics *m, int64_t slot)
 {
+    const course *c = m->course;
+    const int n = m->n;
+    for (int k = 0; k < n; k++) {
+        const int final = !c || course_is_final(c, k), rests = !c || final || c->pause[k] > 0;
+        for (int i = 0; i < 3 && c; i++)
+            m->goal[i * n + k] = rests ? c->goal[i * n + k] : (double)NAN;
+        if (!m->flies[k] || m->woken[k] >= 0 || (c && c->changed[k] != slot)) continue;
+        m->woken[k] = slot;
+        m->heard[k] = 0;
+        m->wakings++;
+    }
+}
+
+static void follow(metrics *m, int64_t slot)
+{
+    if (m->course && course_advance(m->course, slot, m->last_position)) wake(m, slot);
+}
+
+void metrics_start(metrics *m)
+{
+    if (m->course)
+        follow(m, 0);
+    else
+        wake(m, 0);
+}
+
+void metrics_compare(metrics *m, int64_t slot, int count, const uint32_t *digest,
+                     const uint16_t *chosen)
+{
+    int split = 0, torn = 0;
+    for (int k = 1; k < count; k++) {
+        split |= digest[k] != digest[0];
+        torn |= chosen[k] != chosen[0];
+    }
+    m->compared += count > 0;
+    m->torn += torn;
+    m->split += split;
+    if (split && m->split_slot < 0) m->split_slot = slot;
+}
+
+/* Nobody has further goals; those that are lost do not count. */
+static int all_final(const metrics *m)
+{
+    for (int k = 0; k < m->n && m->course; k++)
+        if (!m->lost[k] && !course_is_final(m->course, k)) return 0;
+    return 1;
+}
+
+int metrics_update(metrics *m, int64_t slot, int outcome)
+{
+    const int64_t done = slot + 1;
     const double *now = m->track + (long)(m->steps - 1) * 3 * m->n;
-    int state = distances(m, slot) ? METRICS_CRASHED : 0;
-    if (arrived(m, now)) state |= METRICS_ARRIVED;
-    if (m->tables && slot >= m->news_from) news(m, m->tables, slot, now);
-    if (m->tables) wakings(m, m->tables, slot - 1, now);
-    return state;
+    for (int k = 0; k < m->n && !m->slots; k++) /* an agent that flies already has just woken */
+        if (m->woken[k] >= 0 && m->woken[k] < slot) m->woken[k] = slot;
+    m->slots = done;
+    m->outcomes[outcome]++;
+    const int crashed = distances(m, done), at_targets = arrived(m, now);
+    if (m->tables && done >= m->news_from) news(m, m->tables, done, now);
+    if (m->tables) wakings(m, m->tables, slot, now);
+    follow(m, done);
+    if (crashed && m->crash_slot < 0) {
+        m->crash_slot = done;
+        m->crash_1 = m->pair_1;
+        m->crash_2 = m->pair_2;
+        if (m->stop_on_crash) return m->end = METRICS_CRASHED;
+    }
+    if (at_targets && !m->waits && m->completion_slot < 0 && all_final(m)) {
+        m->completion_slot = done;
+        m->limit = done + m->tail;
+    }
+    if (done >= m->limit) m->end = m->completion_slot < 0 ? METRICS_TIMED_OUT : METRICS_COMPLETED;
+    return m->end;
 }

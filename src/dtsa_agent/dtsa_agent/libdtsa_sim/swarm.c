@@ -6,6 +6,7 @@
  */
 #include "swarm.h"
 
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -56,10 +57,11 @@ static const char *check(const swarm *s)
 
 const char *swarm_open(swarm *s)
 {
-    const char *fault = check(s);
     const size_t n = (size_t)s->config.agents, l = (size_t)s->local_count;
-    const size_t bytes = swarm_policy_bytes(&s->config);
+    s->config.target = s->known_goal;
+    const char *fault = check(s);
     if (fault) return fault;
+    const size_t bytes = swarm_policy_bytes(&s->config);
     s->scratch = calloc((size_t)scratch_doubles(s->config.agents), sizeof(double));
     s->ages = calloc(n, sizeof(double));
     s->tables = calloc((size_t)s->table_count + 1, sizeof *s->tables);
@@ -107,6 +109,27 @@ void swarm_reset(swarm *s)
 }
 
 void swarm_restart(swarm *s, int l) { agent_forget(&s->agents[l]); }
+
+/* ---- goals ---- */
+
+/* Only the own state of each agent is looked at. */
+void swarm_advance(swarm *s, course *c, int64_t slot)
+{
+    const int n = s->config.agents, count = s->local_count;
+    const double *last = c->goals + (long)(c->goal_count - 1) * 3 * n;
+    if (course_advance(c, slot, s->position) || slot == 0) {
+        memcpy(s->goal, c->goal, sizeof(double) * 3 * (size_t)count);
+        for (int l = 0; l < count; l++) s->final[l] = (uint8_t)course_is_final(c, l);
+    }
+    /* An agent that waits for its first slot stands at its start, and all know that. */
+    for (int e = 0; e < 3 * n && s->goals_known; e++)
+        s->known_goal[e] = (c->begin[e % n] <= slot ? last : c->start)[e];
+    for (int l = 0; l < count; l++) {
+        const int64_t said = s->sent_slot[(s->shared ? 0 : (long)l * n) + s->local[l]];
+        const int waits = s->announce && said >= 0 && said < c->changed[l];
+        s->active[l] = c->moving[s->local[l]] && c->leg[l] >= 0 && !waits;
+    }
+}
 
 /* ---- decisions and frames ---- */
 
@@ -259,17 +282,17 @@ void swarm_move(swarm *s, int step)
     memcpy(s->track + (long)step * 3 * count, s->position, sizeof(double) * 3 * (size_t)count);
 }
 
-void swarm_fly(swarm *s, int64_t slot)
+void swarm_fly(swarm *s, int64_t slot, int estimated)
 {
     for (int step = 0; step < s->config.steps; step++) {
-        swarm_steer(s, slot, step, 1);
+        swarm_steer(s, slot, step, step > 0 || !estimated);
         swarm_move(s, step);
     }
 }
 
-void swarm_complete(swarm *s, int64_t slot, int all, const uint8_t *heard)
+void swarm_complete(swarm *s, int64_t slot, int estimated, int all, const uint8_t *heard)
 {
-    swarm_fly(s, slot);
+    swarm_fly(s, slot, estimated);
     for (int i = 0; i < s->sender_count && (all || heard); i++) {
         const int l = s->senders[i];
         swarm_hear(s, slot, s->frames + (long)l * DTSA_FRAME_MAX, s->frame_length[l],
@@ -324,4 +347,48 @@ dtsa_station_agent swarm_station_agent(swarm_pilot *pilot)
 {
     return (dtsa_station_agent){pilot,       pilot_open,    pilot_hear,  pilot_unsent,
                                 pilot_close, pilot_restart, pilot_leave, pilot_on_probation};
+}
+
+/* ---- learning ---- */
+
+static void observe(const swarm *s, int l, int64_t slot, float *out)
+{
+    const dtsa_table *t = &s->tables[l];
+    const int n = s->config.agents, self = s->local[l];
+    float *planes = out + SWARM_OBSERVED_OWN;
+    double position[3], velocity[3], goal[3], away2 = 0.0;
+    int frame = 0;
+    take_vector(s, s->position, l, position);
+    take_vector(s, s->velocity, l, velocity);
+    take_vector(s, s->goal, l, goal);
+    for (int j = 0; j < n; j++) {
+        const int k = (self + j) % n;
+        const int64_t sent = t->sent_slot[k], ago = sent < 0 ? 0 : slot - sent;
+        const double since = (double)ago * s->config.slot_s;
+        frame |= slot > 0 && sent == slot - 1;
+        planes[j] = (float)(ago - 1);
+        planes[n + j] = (float)(slot - 1 - t->last[k]);
+        planes[2 * n + j] = (float)t->in_ap[k];
+        for (int i = 0; i < 3; i++) {
+            const double p = t->sent_p[i * n + k], v = t->sent_v[i * n + k];
+            planes[(3 + i) * n + j] = (float)(p + v * since - position[i]);
+            planes[(6 + i) * n + j] = (float)(v - velocity[i]);
+        }
+    }
+    for (int i = 0; i < 3; i++) {
+        const double way = goal[i] - position[i];
+        away2 += way * way;
+        out[4 + i] = (float)way;
+        out[7 + i] = (float)velocity[i];
+    }
+    out[0] = (float)slot;
+    out[1] = (float)((self + n - slot % n) % n);
+    out[2] = (float)frame;
+    out[3] = (float)(sqrt(away2) > s->config.r_min);
+}
+
+void swarm_observe(const swarm *s, int64_t slot, int first, int end, float *out)
+{
+    const long size = SWARM_OBSERVED_OWN + SWARM_OBSERVED_PLANES * (long)s->config.agents;
+    for (int l = first; l < end; l++) observe(s, l, slot, out + (l - first) * size);
 }

@@ -4,6 +4,7 @@
 #define DTSA_SWARM_H
 
 #include "core.h"
+#include "course.h"
 #include "dtsa_station.h"
 #include "policy/policy.h"
 #include "vehicle.h"
@@ -11,7 +12,9 @@
 typedef struct swarm {
     dtsa_config config;
     int local_count, table_count;
-    int shared; /* one table serves every agent */
+    int shared;      /* one table serves every agent */
+    int announce;    /* an agent with a new goal hovers until it has sent a frame that says so */
+    int goals_known; /* all know where everybody wants to be in each slot */
     vehicle_params vehicle;
 
     /* Borrowed: v = table_count, l = local_count, n = agents; p = swarm_policy_bytes. */
@@ -26,6 +29,7 @@ typedef struct swarm {
     double *priority;                                    /* (v, n) */
     int64_t *counter;                                    /* (v, n) */
     double *position, *velocity, *command, *goal;        /* (3, l) */
+    double *known_goal;                                  /* (3, n) where all take those who rest */
     double *track;                                       /* (steps, 3, l) */
     uint8_t *active, *final, *present;                   /* (l) see core.h */
     uint16_t *chosen;                                    /* (l) */
@@ -53,6 +57,8 @@ void swarm_close(swarm *s);
 
 void swarm_reset(swarm *s);
 void swarm_restart(swarm *s, int l); /* knows nothing but the settings */
+/* A slot begins: goals and activity of the agents, by the plan of the scenario. */
+void swarm_advance(swarm *s, course *c, int64_t slot);
 void swarm_decide(swarm *s, int64_t slot);
 /* Encodes the frames of all whose `sends` is set; lists them in senders; -> their number. */
 int swarm_emit(swarm *s, int64_t slot);
@@ -64,10 +70,11 @@ void swarm_estimate(swarm *s, int table, int64_t slot, int step);
 void swarm_estimate_all(swarm *s, int64_t slot, int step);
 void swarm_steer(swarm *s, int64_t slot, int step, int estimate);
 void swarm_move(swarm *s, int step);
-void swarm_fly(swarm *s, int64_t slot);
+/* estimated: the estimates of all tables are those for the start of the slot. */
+void swarm_fly(swarm *s, int64_t slot, int estimated);
 /* The rest of a slot whose frames are the swarm's own: fly, hear, end. heard (senders, v): which
  * tables hear each; NULL: `all` of them, or none. */
-void swarm_complete(swarm *s, int64_t slot, int all, const uint8_t *heard);
+void swarm_complete(swarm *s, int64_t slot, int estimated, int all, const uint8_t *heard);
 
 /* The only local agent of a swarm behind a station. */
 typedef struct swarm_pilot {
@@ -79,5 +86,11 @@ typedef struct swarm_pilot {
 } swarm_pilot;
 /* Its pilot is the context, and has to stay. */
 dtsa_station_agent swarm_station_agent(swarm_pilot *pilot);
+
+/* What local agents with tables of their own, from `first` up to `end`, have heard before a slot,
+ * as numbers for learning. Of each: SWARM_OBSERVED_OWN, and SWARM_OBSERVED_PLANES of n, itself first
+ * and those with the next ids. */
+enum { SWARM_OBSERVED_OWN = 10, SWARM_OBSERVED_PLANES = 9 };
+void swarm_observe(const swarm *s, int64_t slot, int first, int end, float *out);
 
 #endif

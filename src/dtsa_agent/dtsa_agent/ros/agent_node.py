@@ -12,13 +12,11 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import MAX_AGENTS
 from dtsa_agent.core.settings.declaration import Setting
 from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.namespaces import declare_swarm_namespace
-from dtsa_agent.ros.common.graph.parameters import declare_setting
+from dtsa_agent.ros.common.graph.parameters import declare_setting, declare_swarm_namespace
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import node_options, run_node
-from dtsa_agent.ros.common.workarounds.kept_nodes import ending
+from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
 
-from .hosting import declare_swarm, host_agents
+from .swarm_host import declare_swarm, host_agents
 
 _UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace
 
@@ -27,16 +25,16 @@ _AIR = Setting("air", "text", CHANNEL, "what carries the frames: the channel's n
 
 
 def _make_node(supervised: bool) -> tuple[Node, int, str]:
-    """The node in its agent's namespace, the agent's id (parameter ``id``, or the namespace's number), its swarm."""
-    plain = node_options(supervised)
-    node = Node("agent", namespace=_UNNAMED, **plain)
+    """Return the node in its agent's namespace, the agent's id (parameter ``id``, or of the namespace), its swarm."""
+    options = node_options(supervised)
+    node = Node("agent", namespace=_UNNAMED, **options)
     namespace = node.get_namespace()
     digits = namespace.rpartition("cf")[2]
     agent = _own_id(node, int(digits) if digits.isdigit() and namespace != _UNNAMED else 1)
     space = declare_swarm_namespace(node)
     if namespace == _UNNAMED:
         node.destroy_node()
-        node = Node("agent", namespace=names.agent_namespace(agent, space), **plain)
+        node = Node("agent", namespace=names.agent_namespace(agent, space), **options)
         _own_id(node, agent)
         declare_swarm_namespace(node)
     return node, agent, space
@@ -52,7 +50,7 @@ def _body(stop: Stop, supervised: bool) -> int | None:
     with ending(node):
         air = _AIR.check(declare_setting(node, _AIR))
         if air != CHANNEL:
-            from .port_node import fly_over_port  # other agents need no port
+            from .odometry_vehicle import fly_over_port  # other agents need no port
 
             return fly_over_port(node, air, agent, stop)
         config = declare_swarm(node)

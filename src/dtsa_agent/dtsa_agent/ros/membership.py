@@ -18,23 +18,13 @@ from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.runs import Call, run_text
 from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire.checks import (
-    FORGED_END,
-    OTHER_RUN,
-    OTHER_SENDER,
-    RANGE,
-    OnePublisher,
-    Unusable,
-    check_slot,
-    parse_json,
-    plain,
-)
-from dtsa_agent.ros.common.wire.intake import Intake, add_counts
-from dtsa_agent.ros.common.wire.slot_fields import SlotFields
+from dtsa_agent.ros.common.wire import checks
+from dtsa_agent.ros.common.wire.checks import Intake, OnePublisher, Unusable
+from dtsa_agent.ros.common.wire.messages import Fields
 
 _GONE_S = 6.0  # a channel that nobody has seen for so long will not come back; it announces itself every 3 s
-_TELL_S = 0.5  # counts are told that often at most
-_REFUSED_S = 10.0  # who has taken part for so long is not sent away any more
+_TELL_S = 0.5  # counts are published that often at most
+_REFUSED_S = 10.0  # a process that has taken part for so long is not sent away any more
 _MOST_CALLERS = 16
 # A process that comes late shows itself on so many calls, one a second: it may find the channel before that finds it.
 _INTRODUCTIONS = 30
@@ -53,12 +43,11 @@ class _Caller:
 class Membership:
     """Answers channels that call, binds to the run that begins, and keeps out what is not of that run.
 
-    :param node: the ROS node.
-    :param ids: ids of the agents here.
+    :param ids: of the agents here.
     :param settings: as :func:`agreed_settings` gives them.
     :param swarm_namespace: namespace of the swarm's topics.
-    :param dropped_frames: number of frames kept out so far, by reason.
-    :param plausible: raises :class:`Unusable` for a slot message that cannot be the next one, by its slot and time.
+    :param dropped_frames: returns the number of frames kept out so far, by reason.
+    :param check_next: raises :class:`Unusable` for a slot message that cannot be the next one, by its slot and time.
     """
 
     def __init__(
@@ -66,13 +55,13 @@ class Membership:
         node: Node,
         ids: Sequence[int],
         settings: Mapping[str, Any],
-        swarm_namespace: str = names.SWARM,
-        dropped_frames: Callable[[], dict[str, int]] = dict,
-        plausible: Callable[[SlotFields], None] = lambda message: None,
+        swarm_namespace: str,
+        dropped_frames: Callable[[], dict[str, int]],
+        check_next: Callable[[Fields], None],
     ) -> None:
         self.run = 0  # the run's id; 0: none has begun yet
         self.intake = Intake(node.get_logger())
-        self._agents, self._dropped_frames, self._plausible = int(settings["agents"]), dropped_frames, plausible
+        self._agents, self._dropped_frames, self._check_next = int(settings["agents"]), dropped_frames, check_next
         self._callers: dict[int, _Caller] = {}  # by run
         self._began_s = self._told_s = 0.0  # monotonic
         self._unseen = Patience()  # with a channel that is not on the graph
@@ -85,61 +74,55 @@ class Membership:
         self._node = node.get_fully_qualified_name()
         self._ids = list(ids)
 
-    def admits(self, message: SlotFields, number: int | None, sender: bytes | None) -> bool:
+    def admits(self, message: Fields, sender: bytes | None) -> bool:
         """Whether a slot message is one of this run; others are counted. A channel that calls is answered.
 
-        :param message: the message.
-        :param number: its number, as its publisher counts.
-        :param sender: who sent it; None: not known.
         :raises ConfigError: when the channel refuses this process.
         """
         try:
-            self._check(message, number, sender)
+            self._check(message, sender)
         except Unusable as error:
             self.intake.drop(error.reason, str(error))
             return False
         return True
 
-    def _check(self, message: SlotFields, number: int | None, sender: bytes | None) -> None:
-        check_slot(message, self._agents)
+    def _check(self, message: Fields, sender: bytes | None) -> None:
+        checks.check_slot(message, self._agents)
         run, phase = message.run, message.phase
         calls = phase in (Slot.PREPARE, Slot.START)
         if self.run and run != self.run:
             if phase == Slot.PREPARE:
                 self._following = run
-                self._tell(left_over=True)
-            raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}; this one is {run_text(self.run)}")
+                self._publish_counts(left_over=True)
+            raise Unusable(checks.OTHER_RUN, f"slot message of run {run_text(run)}; this one is {run_text(self.run)}")
         caller = self._callers.get(run)
         if caller is None:
             if not calls:
-                raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}, which has not called this process")
+                raise Unusable(checks.OTHER_RUN, f"slot message of run {run_text(run)}, which has not called here")
             caller = self._meet(run, message.data, sender)
         if phase == Slot.END:
             if not caller.call.ended_by(message.data):
-                raise Unusable(FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
+                raise Unusable(checks.FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
             self._told_s = 0.0
-            self._tell()
+            self._publish_counts()
             return
-        self._plausible(message)
-        if not caller.publisher.admits(number, time.monotonic(), sender):
-            raise Unusable(OTHER_SENDER, f"slot message {number} of run {run_text(run)}, not of its channel")
+        self._check_next(message)
+        if not caller.publisher.admits(time.monotonic(), sender):
+            raise Unusable(checks.OTHER_SENDER, f"a slot message of run {run_text(run)}, not of its channel")
         if phase == Slot.REFUSE:
             self._refused(message.data)
-        if phase == Slot.PREPARE:
-            caller.introductions = _INTRODUCTIONS
-            self._introduce(run)
-        elif calls and caller.introductions < _INTRODUCTIONS:
-            caller.introductions += 1
-            self._introduce(run)
+        if phase == Slot.PREPARE or (calls and caller.introductions < _INTRODUCTIONS):
+            caller.introductions = _INTRODUCTIONS if phase == Slot.PREPARE else caller.introductions + 1
+            self._publish(run, self._settings)
 
     def _meet(self, run: int, data: bytes, sender: bytes | None) -> _Caller:
         """A channel calls for the first time."""
         if not run:
-            raise Unusable(OTHER_RUN, "a call without a run")
+            raise Unusable(checks.OTHER_RUN, "a call without a run")
         try:
             call = Call.from_bytes(data)
         except ValueError as error:
-            raise Unusable(RANGE, f"a call of nobody: {error}") from None
+            raise Unusable(checks.RANGE, f"a call of nobody: {error}") from None
         while len(self._callers) >= _MOST_CALLERS:
             del self._callers[next(run for run in self._callers if run != self.run)]
         caller = self._callers[run] = _Caller(call, sender)
@@ -150,10 +133,7 @@ class Membership:
         return bool(self._publisher.get_subscription_count())
 
     def begin(self, run: int) -> None:
-        """The run begins for this process: from now on it belongs to no other.
-
-        :param run: its id.
-        """
+        """The run begins for this process: from now on it belongs to no other."""
         self.run = run
         self._began_s, self._unseen = time.monotonic(), Patience()
 
@@ -170,70 +150,59 @@ class Membership:
         if int.from_bytes(data[:8], "little") != self._process:
             return
         if self.run and time.monotonic() - self._began_s > _REFUSED_S:
-            raise Unusable(OTHER_SENDER, "this process takes part, and is told to go")
+            raise Unusable(checks.OTHER_SENDER, "this process takes part, and is told to go")
         try:
-            reason = parse_json(data[8:])
+            reason = checks.parse_json(data[8:])
         except ValueError:
             reason = None
         if not isinstance(reason, list) or len(reason) != 3:
-            raise Unusable(RANGE, "a refusal without a reason")
-        raise ConfigError(plain(str(reason[0])), reason[1], plain(str(reason[2])))
+            raise Unusable(checks.RANGE, "a refusal without a reason")
+        raise ConfigError(checks.plain(str(reason[0])), reason[1], checks.plain(str(reason[2])))
 
-    # -- to the channel
-
-    def _introduce(self, run: int) -> None:
-        message = self._message(run)
-        message.settings = self._settings
-        self._publisher.publish(message)
-
-    def _tell(self, left_over: bool = False) -> None:
-        """Tells the counts of this run's messages, not too often."""
-        now = time.monotonic()
-        if now - self._told_s < _TELL_S:
-            return
-        counts = self.counts()
-        if left_over or (self.run and counts != self._told):
+    def _publish_counts(self, left_over: bool = False) -> None:
+        """Publish the counts of this run's messages, not too often."""
+        now, counts = time.monotonic(), self.counts()
+        if now - self._told_s >= _TELL_S and (left_over or (self.run and counts != self._told)):
             self._told, self._told_s = counts, now
-            self._publisher.publish(self._message(self.run))
+            self._publish(self.run)
 
-    def close(self) -> None:
-        """Lets the last counts arrive before this process ends: what it has published goes with it."""
-        self._publisher.wait_for_all_acked(_DELIVERY)
-
-    def _message(self, run: int) -> Process:
+    def _publish(self, run: int, settings: str = "") -> None:
         counts = self.counts()
-        return Process(
-            header=Header(frame_id=names.FRAME),
-            run=run,
-            process=self._process,
-            node=self._node,
-            agent=self._ids,
-            settings_hash=self._hash,
-            dropped_reason=list(counts),
-            dropped=list(counts.values()),
+        self._publisher.publish(
+            Process(
+                header=Header(frame_id=names.FRAME),
+                run=run,
+                process=self._process,
+                node=self._node,
+                agent=self._ids,
+                settings_hash=self._hash,
+                settings=settings,
+                dropped_reason=list(counts),
+                dropped=list(counts.values()),
+            )
         )
 
     def counts(self) -> dict[str, int]:
-        """Messages and frames not taken in so far, by reason."""
+        """Return the number of messages and frames not received so far, by reason."""
         counts = dict(self.intake.counts)
-        add_counts(counts, {name: count for name, count in self._dropped_frames().items() if count})
+        checks.add_counts(counts, {name: count for name, count in self._dropped_frames().items() if count})
         return counts
 
-    # -- now and then
-
     def idle(self, publishers: int, slot: int) -> None:
-        """Looks around; called about ten times a second.
+        """Look around, about ten times a second: number of publishers of slot messages, last slot answered.
 
-        :param publishers: number of publishers of slot messages on the graph.
-        :param slot: the last slot that was answered.
         :raises LocalProtocolError: when the channel has gone without ending the run.
         """
         if not self.run:
             return
-        self._tell()
+        self._publish_counts()
         channel = self._callers[self.run].call.channel
-        if publishers or channel.paused:  # who is stopped for long leaves the graph, too, and comes back
+        if publishers or channel.paused:  # one that is stopped for long leaves the graph, too, and comes back
             self._unseen = Patience()
         if self._unseen.look() > _GONE_S or channel.gone:
             following = f"; run {run_text(self._following)} calls now" if self._following else ""
             raise LocalProtocolError(f"the channel has gone after slot {slot} without ending the run{following}")
+
+    def close(self) -> None:
+        """Let the last counts arrive before this process ends: what it has published goes with it."""
+        self._publisher.wait_for_all_acked(_DELIVERY)

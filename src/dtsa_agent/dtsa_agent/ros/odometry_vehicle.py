@@ -1,10 +1,13 @@
-"""A vehicle that offers odometry and takes velocities, flown by an agent on a network. docs/how-to/vehicles.md."""
+"""``ros2 run dtsa_agent agent`` with ``air:=udp`` or another port; a vehicle on the graph. docs/how-to/vehicles.md."""
 
 from __future__ import annotations
 
+import json
 import math
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import Any
 
 import numpy as np
@@ -16,12 +19,22 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from dtsa_agent.core.settings.declaration import Settings, setting
+from dtsa_agent.air.driver import LiveAgent
+from dtsa_agent.air.ports import make_settings, open_port, settings_class
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.core.settings.declaration import Setting, Settings, setting, settings_of
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings
 from dtsa_agent.ros.common.process.loop import HOUSEKEEPING_S, Feed
-from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, RANGE, OnePublisher, Unusable, check_odometry
-from dtsa_agent.ros.common.wire.intake import Intake
+from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, RANGE, Intake, OnePublisher, Unusable, check_odometry
+from dtsa_agent.stop import Stop
+
+_DEFAULTS = {"policy": "lease", "auth": True}  # as of `tools/dtsa agent`
+_OUT = Setting("out", "text", "", "directory for its bag and summary.json, empty or new; empty text: none")
+_RECORDERS = "dtsa.recorders"  # group of entry points: what records is in a package above this one
 
 SIMULATED, ODOMETRY = "simulated", "odometry"
 BODY, MAP = "body", "map"
@@ -30,15 +43,12 @@ _LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LONGEST_PREDICTION_S = 0.15
 _SLACK_M = 0.5  # odometry may be off by this from one message to the next
 _HOLD_GAIN, _HOLD_MPS = 1.0, 0.3  # 1/s, m/s: of an agent that hovers
-_STOPS, _STOPS_S = 5, 0.1  # how often an agent that ends says to its vehicle to stop, within which time
+_STOPS, _STOPS_S = 5, 0.1  # how often an agent that ends tells its vehicle to stop, within which time
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleSettings(Settings):
-    """The vehicle of an agent on a network.
-
-    :raises ConfigError: for values that are not allowed.
-    """
+    """The vehicle of an agent on a network."""
 
     vehicle: str = setting(
         SIMULATED, "what the agent flies: the simulated vehicle, or one with odometry", choices=(SIMULATED, ODOMETRY)
@@ -65,14 +75,10 @@ class VehicleSettings(Settings):
 
 
 class OdometryVehicle:
-    """See the module; a :class:`~dtsa_agent.air.vehicle.Vehicle`.
+    """A vehicle that offers odometry and takes velocities; a :class:`~dtsa_agent.air.vehicle.Vehicle`.
 
     Odometry that cannot be, or lies where the vehicle cannot have got since the last one that was believed, is counted
     and not used. Without any for a while the vehicle gets the velocity 0, and the agent says that it stands.
-
-    :param node: the node whose topics they are.
-    :param settings: names and limits.
-    :param slot_s: s, length of a slot.
     """
 
     def __init__(self, node: Node, settings: VehicleSettings, slot_s: float) -> None:
@@ -86,16 +92,16 @@ class OdometryVehicle:
         kind = TwistStamped if settings.command_type == TWIST else VelocityWorld
         self._publisher = node.create_publisher(kind, settings.command_topic, 1)
         self._feed = Feed(node, Odometry, settings.odometry_topic, _LATEST, intake=self.intake)
-        self._pilot = OnePublisher()  # who tells where the vehicle is
+        self._pilot = OnePublisher()  # of the odometry
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._next_service_s = 0.0
 
     def close(self) -> None:
-        """The agent has ended, however that came: the vehicle shall stand.
+        """Stop the vehicle: the agent has ended.
 
-        One message may be lost, above all one whose publisher is gone a moment later: it is said several times, and
-        who takes it reliably has a while to say that it has it.
+        One message may be lost, above all one whose publisher is gone a moment later: several are sent, and reliable
+        receivers have a while to acknowledge them.
         """
         try:
             for _ in range(_STOPS):
@@ -108,50 +114,45 @@ class OdometryVehicle:
 
     def ready(self) -> bool:
         """Whether odometry has come, and is fresh."""
-        self._look()
+        self._update()
         return self._fresh() is not None
 
     def _fresh(self) -> tuple[float, Any, Any] | None:
         last = self._last
         return last if last is not None and time.monotonic() - last[0] < self._settings.stale_s else None
 
-    def _look(self) -> None:
-        """Takes in what has come, and serves whoever asks for parameters."""
+    def _update(self) -> None:
+        """Accept what has come, and serve the node's parameters."""
         message = self._feed.take()
         if message is not None:
-            self._take(message)
+            with self.intake.guard():
+                self._accept(message)
         if time.monotonic() >= self._next_service_s:
             self._next_service_s = time.monotonic() + HOUSEKEEPING_S
             self._executor.spin_once(timeout_sec=0.0)
 
-    def _take(self, message: Odometry) -> None:
-        with self.intake.guard():
-            check_odometry(message)
-            if not self._pilot.admits(self._feed.number, time.monotonic(), self._feed.sender):
-                raise Unusable(OTHER_SENDER, "odometry from two publishers")
-            now, last = time.monotonic(), self._last
-            place, speed = message.pose.pose.position, message.twist.twist.linear
-            position = np.array((place.x, place.y, place.z)) + self._origin
-            velocity = np.array((speed.x, speed.y, speed.z))
-            q = message.pose.pose.orientation
-            attitude = (q.x, q.y, q.z, q.w)
-            if self._settings.twist_frame == BODY:
-                velocity = turned(attitude, velocity)
-            fastest = self._settings.fastest_mps
-            if math.sqrt(float(velocity @ velocity)) > fastest:
-                raise Unusable(RANGE, f"odometry of more than {fastest:g} m/s")
-            if last is not None:
-                away = position - last[1]
-                if math.sqrt(float(away @ away)) > _SLACK_M + fastest * (now - last[0]):
-                    raise Unusable(RANGE, "odometry that has jumped")
-            self._last, self._attitude = (now, position, velocity), attitude
+    def _accept(self, message: Odometry) -> None:
+        check_odometry(message)
+        now, last = time.monotonic(), self._last
+        if not self._pilot.admits(now, self._feed.sender):
+            raise Unusable(OTHER_SENDER, "odometry from two publishers")
+        place, speed, q = message.pose.pose.position, message.twist.twist.linear, message.pose.pose.orientation
+        position = np.array((place.x, place.y, place.z)) + self._origin
+        velocity, attitude = np.array((speed.x, speed.y, speed.z)), (q.x, q.y, q.z, q.w)
+        if self._settings.twist_frame == BODY:
+            velocity = turned(attitude, velocity)
+        fastest = self._settings.fastest_mps
+        if math.sqrt(float(velocity @ velocity)) > fastest:
+            raise Unusable(RANGE, f"odometry of more than {fastest:g} m/s")
+        if last is not None:
+            away = position - last[1]
+            if math.sqrt(float(away @ away)) > _SLACK_M + fastest * (now - last[0]):
+                raise Unusable(RANGE, "odometry that has jumped")
+        self._last, self._attitude = (now, position, velocity), attitude
 
     def sense(self, swarm: Swarm) -> None:
-        """See Vehicle.
-
-        :param swarm: the agent.
-        """
-        self._look()
+        """See Vehicle."""
+        self._update()
         fresh = self._fresh()
         if fresh is None:
             swarm.velocity[:, 0] = 0.0
@@ -163,11 +164,7 @@ class OdometryVehicle:
         swarm.track[:, :, 0] = swarm.position[:, 0]
 
     def fly(self, swarm: Swarm, slot: int) -> None:
-        """See Vehicle.
-
-        :param swarm: the agent.
-        :param slot: the slot.
-        """
+        """See Vehicle."""
         if slot % self._every:
             return
         swarm.steer(slot, 0)
@@ -182,10 +179,7 @@ class OdometryVehicle:
         self._command(swarm.command[:, 0])
 
     def _command(self, velocity: Any) -> None:
-        """Publishes a velocity.
-
-        :param velocity: (3,) m/s, map.
-        """
+        """Publish a velocity, (3,) m/s, map."""
         if self._settings.command_frame == BODY:
             x, y, z, w = self._attitude
             velocity = turned((-x, -y, -z, w), velocity)
@@ -204,11 +198,52 @@ class OdometryVehicle:
 
 
 def turned(q: tuple[float, float, float, float], v: Any) -> Any:
-    """A vector of the body in the map's axes.
-
-    :param q: (4,) attitude as a quaternion x, y, z, w, body in map.
-    :param v: (3,), in the body's axes.
-    """
+    """Return a vector (3,) of the body in the map's axes; q: attitude x, y, z, w, body in map."""
     axis, w = np.array(q[:3]), q[3]
     across = 2.0 * np.cross(axis, v)
     return v + w * across + np.cross(axis, across)
+
+
+def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
+    """Declare the rest of the parameters and fly an agent over a kind of port until a signal; return the exit code.
+
+    :raises ConfigError: for settings that are not usable.
+    """
+    config = SwarmConfig.from_dict(declare_settings(node, SwarmConfig, defaults=_DEFAULTS))
+    own = AgentSettings(id=agent, **declare_settings(node, AgentSettings, skip=("id",)))
+    cls = settings_class(air)
+    needed = {setting.name: "" for setting in settings_of(cls) if setting.required}  # an error if they are not given
+    chosen = make_settings(air, declare_settings(node, cls, defaults=needed))
+    settings = VehicleSettings.from_dict(declare_settings(node, VehicleSettings))
+    vehicle = OdometryVehicle(node, settings, config.slot_s) if settings.vehicle == ODOMETRY else None
+    out = str(declare_setting(node, _OUT))
+    check_parameters(node)
+    record = _recorder(out) if out else None
+    logger = node.get_logger()
+    try:
+        with open_port(chosen) as port:
+            flying = LiveAgent(own, config, port, vehicle=vehicle, say=logger.warning)
+            with nullcontext() if record is None else record(out, flying, chosen) as recorder:
+                flying.run(stop)
+            summary = flying.summary() if recorder is None else recorder.summary
+            logger.info(f"ends: {json.dumps(summary)}")
+    finally:
+        if vehicle is not None:
+            vehicle.close()
+    if recorder is not None and recorder.failure:
+        raise DtsaError(recorder.failure)
+    return 0
+
+
+def _recorder(out: str) -> Any:
+    """Return what records an agent, as ``recorder(out, agent, port_settings)``: a context in which it flies.
+
+    :raises ConfigError: if there is none here.
+    """
+    recorders = [*entry_points(group=_RECORDERS, name="agent")]
+    if not recorders:
+        raise ConfigError("out", out, "no directory, for the package dtsa_bench, which records, is not here")
+    try:
+        return recorders[0].load()
+    except ImportError as error:
+        raise ConfigError("out", out, f"no directory, for what records cannot be imported ({error})") from None

@@ -1,24 +1,23 @@
-"""Agents on their own clocks: nobody waits for anybody, and a frame that is late is late.
+"""Agents on their own clocks: no agent waits for another, and a frame that is late is late.
 
 How a flight in real time works, and where each part stands ("channel": `dtsa_channel_sim/ros`):
 
-1. **The time line.** The channel calls all processes (`roll_call`), then sends START with the time of slot 0 on
-   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own (`air/driver.ClockMap`),
+1. **The time line.** The channel calls all processes (`roster`), then sends START with the time of slot 0 on
+   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own (`air/port.ClockMap`),
    off by an offset and a drift.
-2. **A slot here.** Each agent is a station (`core/station`, `realtime_agent`), and says when it is due:
-   :meth:`RealtimeNode._serve`. It ends the slot before, decides, and gives the frame to send. That is published with
-   the time at which its transmission starts, mostly some time ahead; then the vehicles move. A frame that would leave
-   half a slot late is not sent.
-3. **On the air.** The channel (`realtime_channel`) puts each frame on the time line (`live_air`, `model/air`). Once no
-   frame that overlaps it can come any more, it is settled: who heard it, by reach, overlap and losses. A RUN message
-   delivers it to all processes with the receivers' bits.
-4. **Heard.** :meth:`~RealtimeNode._hear` hands it to the stations of those agents whose bit is set. The time of its
+2. **A slot here.** Each agent is a station (`core/station`) that says when it is due: :meth:`RealtimeNode._serve`. It
+   ends the slot before, decides, and gives the frame to send. That is published with the time at which its transmission
+   starts, mostly some time ahead; then the vehicles move. A frame that would leave half a slot late is not sent.
+3. **On the air.** The channel (`realtime_channel`) puts each frame on the time line (`model/air`). Once no frame that
+   overlaps it can come any more, its receivers are known, by reach, overlap and losses. A RUN message delivers it to
+   all processes with the receivers' bits.
+4. **Received.** :meth:`~RealtimeNode._hear` hands it to the stations of those agents whose bit is set. The time of its
    arrival shows which slot it is of, and moves their own slots.
-5. **Told.** Some ten times a second a process reports what its agents decided, took in and flew (`reporter`). The
-   channel fills an account for each slot (`accounts`); it closes when all have reported or have been given up. The
+5. **Reported.** Some ten times a second a process reports what its agents decided, received and flew (`reporter`). The
+   channel fills an account for each slot (`answers`); it closes when all have reported or have been given up. The
    recorder, the metrics and the live view get closed accounts only: what agents had, not what they should have had.
-6. **Late.** Nobody is waited for. An agent that is behind by too much begins anew with the present slot, in probation.
-   `pace` says how far the channel itself is behind; a flight that cannot keep up is ended with the reason.
+6. **Late.** No agent is waited for. One that is behind by too much restarts with the present slot, in probation. The
+   channel itself (`realtime_channel.Pace`) ends a flight that cannot keep up, with the reason.
 7. **Coming and going.** A late agent listens, takes the time from the first frame that it hears, and hovers until the
    others know it: all rules of the station. One that gets a signal says in its own turns that it leaves, and ends then
    (:meth:`~RealtimeNode._ended`).
@@ -30,7 +29,7 @@ import os
 import time
 from array import array
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -43,6 +42,8 @@ from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.agents.agent import REFUSED
 from dtsa_agent.core.authentication import Authenticator
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator
 from dtsa_agent.core.station import (
     KEEPS_NOTHING,
     KEEPS_NUMBERS,
@@ -52,53 +53,146 @@ from dtsa_agent.core.station import (
     REJECTED,
     REPEATED,
     Link,
+    Station,
     StationSettings,
     check_joinable,
 )
+from dtsa_agent.core.swarm import PRESENT_LEAVING
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.priority import take_priority
 from dtsa_agent.ros.common.wire.checks import SIZES, SLOT, Unusable, check_start
+from dtsa_agent.ros.common.wire.messages import Fields, header_of
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
-from dtsa_agent.ros.common.wire.slot_fields import SlotFields
-from dtsa_agent.ros.common.wire.stamps import header_of, time_of
 
-from .realtime_agent import RealtimeAgent
 from .reporter import Reporter
 from .swarm_node import AgentsNode
 
-_PPB = 1_000_000_000
+_NEVER = 1 << 62
 _LONGEST_LEAD_NS = 60_000_000_000  # from the start message to slot 0
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
 _TRUST_NS = 1_000_000  # frames that are off by more do not move slots
-_BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
+_BURST = 64  # messages received at a time: whatever comes, the own slots go on
 _MALFORMED = (LENGTH, NO_FRAME)  # of the reasons for which a station refuses frames
+
+
+class RealtimeAgent:
+    """A station, its clock, and a radio that sends when the slot begins what lies ready by then.
+
+    All times but the station's own are ns on the channel's time line, from the start of slot 0.
+
+    :param clock: its clock; CLOCK_MONOTONIC stands for the channel's time line.
+    :param jitter_ns: standard deviation of the time of a single transmission.
+    :param accepted: called for each frame that the agent receives: sender, its slot, the slot here.
+    :param refused: called with the reason for each that it refuses; empty: because of its content.
+    """
+
+    def __init__(
+        self,
+        id: int,
+        config: SwarmConfig,
+        scenario: Scenario,
+        clock: ClockMap,
+        jitter_ns: float,
+        accepted: Callable[[int, int, int], None],
+        refused: Callable[[str], None],
+    ) -> None:
+        self.id, self.clock = id, clock
+        self.swarm = make_swarm(config, scenario, local=[id])
+        self.slot = -1  # the present one
+        self.start_ns = 0  # of its slot, or of the transmission in it
+        self.frame = b""  # that it sends in this slot
+        self.due_ns = _NEVER
+        self._slot_ns, self._jitter_ns = config.slot_ns, jitter_ns
+        self._random = generator(config.seed, STREAM_CLOCKS, id)
+        self._accepted, self._refused = accepted, refused
+        self._zero = self._start_ns = 0
+        self._opened = False
+
+    def begin(self, settings: StationSettings, zero: int) -> None:
+        """Take part from now on; ``zero``: CLOCK_MONOTONIC at the start of slot 0, ns."""
+        self._zero = zero
+        self.due_ns = self._now()
+        self.station = Station(self.swarm, settings, self.clock.local_ns(self.due_ns), None, self)
+
+    def _now(self) -> int:
+        return time.monotonic_ns() - self._zero
+
+    @property
+    def leaves(self) -> bool:
+        """Whether it still has to say that it leaves."""
+        return bool(self.swarm.present[0] == PRESENT_LEAVING)
+
+    def receive(self, frame: bytes, arrival_ns: int) -> None:
+        """A frame has arrived."""
+        self.station.receive(frame, self.clock.local_ns(arrival_ns))
+        self.due_ns = min(self.due_ns, self._now())
+
+    def step(self) -> bool:
+        """Do what is due now; return True if a slot is open, in which it may send a :attr:`frame`."""
+        self._opened, shown = False, self.clock.local_ns(self._now())
+        due, _ = self.station.step(shown)
+        if self._opened:
+            self._send()
+            shown = self.clock.local_ns(self._now())
+            # Not yet the next slot: this one comes first.
+            due = self.station.step(shown)[0] if shown < self._start_ns else shown
+        self.due_ns = self.clock.monotonic_ns(due)
+        return self._opened
+
+    def _send(self) -> None:
+        """Hand over the frame that lies ready: its transmission begins with the slot, but for jitter, or now."""
+        station, self.frame = self.station, b""
+        self.slot = station.slot
+        self._start_ns = station.slot_start_ns(self.slot)
+        self.start_ns = self.clock.monotonic_ns(self._start_ns)
+        if not self.swarm.frame_length[0]:
+            return
+        jitter = int(self._jitter_ns * self._random.standard_normal()) if self._jitter_ns else 0
+        start = max(self.start_ns + jitter, self._now())
+        late = max(0, start - self.start_ns)
+        # So late that the next turn would be disturbed: the station keeps it back.
+        sent_ns = self._start_ns + (self._slot_ns if late > self._slot_ns // 2 else late)
+        _, self.frame = station.step(sent_ns)
+        if self.frame:
+            station.sent(sent_ns, True)
+            self.start_ns = start
+
+    # Events of the station.
+
+    def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
+        """A slot is open."""
+        self._opened = True
+
+    def restarted(self, slot: int) -> None:
+        """It restarts: nothing to do here."""
+
+    def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
+        """A frame was heard in its slot."""
+        if accepted:
+            self._accepted(sender, slot, self.station.slot)
+        else:
+            self._refused("")
+
+    def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
+        """A frame was not accepted."""
+        self._refused(fault)
 
 
 class RealtimeNode(AgentsNode):
     """Agents that begin their slots by themselves.
 
-    The time line is the channel's: ns from the start of slot 0. An agent's slot starts when its own clock says so; that
-    is off by an offset and a drift, and by what the agent has learned from others' frames. As on a vehicle, where a
-    timer sends what lies ready, decisions are made a little before. A frame carries the time at which its agent starts
-    to send it: its slot's start, or later if it was not ready by then.
+    As on a vehicle, where a timer sends what lies ready, decisions are made a little before a slot. A frame carries the
+    time at which its agent starts to send it: its slot's start, or later if it was not ready by then. A process that
+    comes after the channel's call is told where the time line lies, too, because the stamps of messages are on it.
 
-    A process that was there at the channel's call begins with slot 0. One that comes later is told where the time line
-    lies, too, because the stamps of messages are on it; but its agents take the time of their slots from the first
-    frame that each hears, and know nothing.
-
-    :param node: the ROS node.
-    :param config: the settings that all agents share.
-    :param ids: ids of the agents that live here, ascending.
-    :param swarm_namespace: namespace of the swarm's topics.
+    :param ids: of the agents that live here, ascending.
     :param authenticator: holds the key, if the settings say that frames are authenticated.
-    :param offset_ns: (L,) ns, offset of each agent's clock: positive clocks are early.
-    :param drift_ppb: (L,) parts per billion by which each runs fast.
+    :param clocks: one an agent, on the channel's time line; none: without offset and drift.
     :param jitter_ns: ns, standard deviation of the time of a single transmission.
     :param align: whether agents move their slots towards what they hear.
-    :param flight_time_ns: ns from the order to send a frame until the receivers' flight processors have it: for any
-        frame, and for each of its bytes.
+    :param flight_time_ns: ns from the order to send a frame until the receivers' flight processors have it.
     :param priority: real-time priority of the process, where allowed, once all have found each other; 0: none.
     :param resume_at: m, x, y, z of each agent in turn: where its vehicle hovers when it comes into a flight under way;
         none: at its start in the scenario.
@@ -114,35 +208,31 @@ class RealtimeNode(AgentsNode):
         swarm_namespace: str = names.SWARM,
         *,
         authenticator: Authenticator | None = None,
-        offset_ns: Sequence[int],
-        drift_ppb: Sequence[int],
+        clocks: Sequence[ClockMap] = (),
         jitter_ns: float = 0.0,
         align: bool = True,
-        flight_time_ns: tuple[int, int] = (0, 0),
+        flight_time_ns: int = 0,
         priority: int = 0,
         resume_at: Sequence[float] = (),
     ) -> None:
-        self.slot_ns = config.slot_ns
+        self.slot_ns, self._flight_ns = config.slot_ns, flight_time_ns
         self._authenticator, self._align = authenticator, align
-        self._flight_ns = flight_time_ns[0] + flight_time_ns[1] * config.frame_length
         scenario = make_scenario(config)
+        clocks = clocks or [ClockMap(began_ns=0)] * len(ids)
         self.agents = [
-            RealtimeAgent(
-                agent, config, scenario, ClockMap(offset, drift, 0), jitter_ns,
-                partial(self._accepted, index), self._refuse,
-            )
-            for index, (agent, offset, drift) in enumerate(zip(ids, offset_ns, drift_ppb, strict=True))
-        ]  # fmt: skip
+            RealtimeAgent(agent, config, scenario, clock, jitter_ns, partial(self._accepted, index), self._refuse)
+            for index, (agent, clock) in enumerate(zip(ids, clocks, strict=True))
+        ]
         self._columns = np.array(ids) - 1
-        self._refused = 0  # frames that reached an agent and were not taken in, over all agents
+        self._refused = 0  # frames that reached an agent and were refused, over all agents
         self._faults: set[str] = set()  # why agents have refused the present frame
         self._dropped: Counter[str] = Counter()  # frames that any agent has refused, by reason
         self._priority = priority  # still to be taken
         self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3)
-        self._called = False  # was there when the channel asked who is
+        self._called = False  # the channel called before it started
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
-        self._heard_ns = 0  # ns on the time line, when frames are taken in
-        self._leaves_by: int | None = None  # slot: all have left then at the latest; None: nobody leaves
+        self._heard_ns = 0  # ns on the time line, when frames are handed to the agents
+        self._leaves_by: int | None = None  # slot: all have left then at the latest; None: no agent leaves
         self._signals = 0  # when that began
         super().__init__(node, config, ids, swarm_namespace, names.REALTIME_WAITING)
 
@@ -152,11 +242,11 @@ class RealtimeNode(AgentsNode):
         self._telemetry = create(Report, f"{swarm_namespace}/{names.REPORT}", qos)
         self._reporter = Reporter(self._telemetry, self.config, self.ids)
 
-    def _plausible(self, message: SlotFields) -> None:
+    def _check_next(self, message: Fields) -> None:
         now = time.monotonic_ns()
         if message.phase == Slot.START:
             if not 0 < message.time_ns <= now + _LONGEST_LEAD_NS:
-                raise Unusable(SLOT, f"a start at {message.time_ns / _PPB:.3f} s, which cannot be")
+                raise Unusable(SLOT, f"a start at {message.time_ns / 1e9:.3f} s, which cannot be")
         elif message.phase == Slot.RUN and self._zero:
             if not len(message.sender):
                 raise Unusable(SIZES, "a delivery without a frame")
@@ -178,7 +268,7 @@ class RealtimeNode(AgentsNode):
     # From the call to the end.
 
     def run(self, stop: Stop) -> None:
-        """Flies until the run is over or a signal comes; with policy ``lease`` agents first say that they leave.
+        """Fly until the run is over or a signal comes; with policy ``lease`` agents first say that they leave.
 
         :raises ConfigError: in a flight under way that agents of this policy cannot come into.
         """
@@ -207,13 +297,13 @@ class RealtimeNode(AgentsNode):
         in_time = stop.count == self._signals and self.slot <= self._leaves_by
         if in_time and any(agent.leaves for agent in self.agents):
             return not self.loop.subscription.get_publisher_count()
-        self._reporter.publish(self.run_id, self.slot)
+        self._reporter.publish(self.membership.run, self.slot)
         for publisher in (self._air, self._telemetry):
             publisher.wait_for_all_acked(_DELIVERY)
         return True
 
-    def _prepare(self, message: SlotFields) -> bool:
-        """Answers the channel's call, or takes the start time; False when the run is over."""
+    def _prepare(self, message: Fields) -> bool:
+        """Answer the channel's call, or take the start time; return False when the run is over."""
         if message.phase == Slot.PREPARE:
             self._called = True
             if message.slot > names.FIRST_CALL:
@@ -227,19 +317,16 @@ class RealtimeNode(AgentsNode):
         return message.phase != Slot.END
 
     def _go_first(self) -> None:
-        """Real-time priority, where it may be had.
+        """Take real-time priority, where allowed, but not before all processes have found each other.
 
-        Not earlier: many processes that look for each other keep all processors busy for seconds, and by turns of
-        0.1 s, as real-time priority has them, for minutes.
+        By turns of 0.1 s, as real-time priority has them, that would take minutes.
         """
         if self._priority:
             take_priority(self._priority)
             self._priority = 0
 
     def _may_join(self) -> bool:
-        """Whether the channel has found all that this process sends; who comes late waits for that.
-
-        What is published before is lost, above all what it says about itself. The start is told again and again.
+        """Whether the channel has found all that this process publishes: what is published before is lost.
 
         :raises ConfigError: with a policy whose tables all have to be equal.
         """
@@ -249,10 +336,7 @@ class RealtimeNode(AgentsNode):
         )
 
     def _begin(self, run: int, zero: int) -> None:
-        """The run begins for these agents.
-
-        :param zero: CLOCK_MONOTONIC at the start of slot 0, ns.
-        """
+        """The run begins for these agents, with slot 0 at a time of CLOCK_MONOTONIC, ns."""
         self.membership.begin(run)
         self._zero = zero
         if self._authenticator is not None and not self.config.auth_session:
@@ -271,7 +355,7 @@ class RealtimeNode(AgentsNode):
     # Slots.
 
     def _serve(self) -> bool:
-        """Waits until an agent is due or a message comes; False when the run is over."""
+        """Wait until an agent is due or a message comes; return False when the run is over."""
         remaining = self._zero + min(agent.due_ns for agent in self.agents) - time.monotonic_ns()
         if remaining > 0:
             message = self.loop.wait(min(remaining, _PATIENCE_NS))
@@ -299,13 +383,13 @@ class RealtimeNode(AgentsNode):
             self._fly_on(opened)
         return True
 
-    def _take(self, message: SlotFields) -> bool:
+    def _take(self, message: Fields) -> bool:
         if message.phase == Slot.RUN:
             self._hear(message)
         return message.phase != Slot.END
 
-    def _hear(self, message: SlotFields) -> None:
-        """Hands frames to the agents that receive them."""
+    def _hear(self, message: Fields) -> None:
+        """Hand frames to the agents that receive them."""
         self._heard_ns = time.monotonic_ns() - self._zero
         arrival = message.time_ns - names.TIME_ZERO_NS
         received = unpack_received(message.received, len(message.sender), self.config.agents)
@@ -326,37 +410,33 @@ class RealtimeNode(AgentsNode):
             self._faults.add(fault)
 
     def _send(self, agent: RealtimeAgent) -> None:
-        """Hands the frame of an agent over to the channel, before anything else is done."""
+        """Hand the frame of an agent over to the channel, before anything else is done."""
         if not agent.frame:
             return
         header, data = header_of(names.TIME_ZERO_NS + agent.start_ns), array("B", agent.frame)
-        self._air.publish(Frame(header=header, run=self.run_id, slot=agent.slot, agent=agent.id, data=data))
+        self._air.publish(Frame(header=header, run=self.membership.run, slot=agent.slot, agent=agent.id, data=data))
 
     def _fly_on(self, opened: Sequence[int]) -> None:
-        """Reports the slots that agents have opened, and flies their vehicles through them.
-
-        :param opened: their places among those here.
-        """
+        """Report the slots that agents, by their places here, have opened, and fly their vehicles through them."""
         for index in opened:
             agent = self.agents[index]
             self.slot = max(self.slot, agent.slot)
             offset = agent.start_ns - agent.slot * self.slot_ns
             self._reporter.add_slot(index, agent.slot, offset, len(agent.frame), agent.swarm)
-        for index, _ in self._watched:
-            if index in opened:
-                swarm, stamp = self.agents[index].swarm, names.slot_time_ns(self.agents[index].slot, self.slot_ns)
-                place, speed = swarm.position[:, 0].tolist(), swarm.velocity[:, 0].tolist()
-                self._publish_odometry(index, time_of(stamp), place, speed)
+        for entry in self._watched:
+            if entry[0] in opened:
+                agent = self.agents[entry[0]]
+                self._publish_odometry(entry, agent.swarm, 0, agent.slot)
         for index in opened:
             self._fly(index)
         complete = min(agent.slot for agent in self.agents if agent.slot >= 0)
         if self._reporter.due(complete):
-            self._reporter.publish(self.run_id, complete)
+            self._reporter.publish(self.membership.run, complete)
 
     def _sense(self) -> None:
-        """Takes note of where vehicles are that fly elsewhere."""
+        """Note where vehicles are that fly elsewhere."""
 
     def _fly(self, index: int) -> None:
-        """Flies the vehicle of an agent through its slot."""
+        """Fly the vehicle of an agent through its slot."""
         agent = self.agents[index]
         agent.swarm.fly(agent.slot)

@@ -1,43 +1,174 @@
-"""``ros2 run dtsa_agent swarm_host``: several quadcopters in one process, behind one subscription and one publisher."""
+"""``ros2 run dtsa_agent swarm_host``: several quadcopters in one process, behind one subscription and one publisher.
+
+Its parameters, and how agents run, are also those of ``agent``.
+"""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-from rcl_interfaces.msg import ParameterDescriptor, ParameterType
+from rclpy.node import Node
 
-from dtsa_agent.core.settings.declaration import Setting
-from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
-from dtsa_agent.ros.common.graph.parameters import declare_setting
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
+from dtsa_agent.core.settings.declaration import Setting, Settings, setting
+from dtsa_agent.keys import authenticator, with_key
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.parameters import (
+    check_parameters,
+    declare_list,
+    declare_setting,
+    declare_settings,
+    swarm_wide_node,
+)
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import node_options, run_node
-from dtsa_agent.ros.common.workarounds.kept_nodes import ending
+from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
+from dtsa_agent.ros.common.process.priority import PrioritySettings, give_way_by
 
-from .hosting import declare_swarm, host_agents
-from .swarm_node import parse_ids
+from .swarm_node import AgentsNode, SwarmNode
 
-SHARED = Setting(
-    "shared_table",
-    "bool",
-    False,
+_SHARED = Setting(
+    "shared_table", "bool", False,
     "one table serves all agents here, for as long as all hear the same; policies tdma, dtsa and age; only faster, "
     "changes no flight",
-)
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class HostSettings(Settings):
+    """How agents live in a process, beside what the whole swarm agrees on."""
+
+    odometry: bool = setting(True, "offer each agent's true motion as <agent>/odom")
+    mode: str = setting(
+        names.MODES[0],
+        "in lockstep all wait for each other; in real time each agent has a clock of its own",
+        choices=names.MODES,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeSettings(Settings):
+    """What the agents of a process have in common in real time."""
+
+    clock_jitter_ns: float = setting(
+        0.0, "standard deviation of the time of one transmission", unit="ns", minimum=0, maximum=1e9
+    )
+    align: bool = setting(True, "agents move their slots towards what they hear")
+    nice: int = setting(
+        0,
+        "without real-time priority: by how much this process gives way to others, the channel above all: nice",
+        minimum=0,
+        maximum=19,
+    )
+
+
+def declare_swarm(node: Node) -> SwarmConfig:
+    """Declare the swarm's settings and return their values.
+
+    :raises ConfigError: for settings that are not usable.
+    """
+    return SwarmConfig.from_dict(declare_settings(node, SwarmConfig))
+
+
+def declare_ids(node: Node, agents: int) -> list[int]:
+    """Declare which of N agents live in a process; return their ids, ascending.
+
+    :raises ConfigError: if there are others.
+    """
+    listed = declare_list(node, "ids", [0], "ids of the agents in this process; [0]: all")
+    ids = sorted(agent for agent in listed if agent) or list(range(1, agents + 1))
+    if len(set(ids)) != len(ids) or ids[0] < 1 or ids[-1] > agents:
+        raise ConfigError("ids", listed, f"different ids from 1 to {agents}; none: all")
+    return ids
+
+
+def host_agents(
+    node: Node,
+    ids: Sequence[int],
+    config: SwarmConfig,
+    stop: Stop,
+    space: str = names.SWARM,
+    shared: bool = False,
+    spaces: Sequence[str] | None = None,
+) -> None:
+    """Declare the rest of the parameters and run agents until the end.
+
+    :param ids: of the agents that live here, ascending.
+    :param space: namespace of what the whole swarm shares.
+    :param shared: whether one table serves all.
+    :param spaces: namespace of each agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
+    :raises ConfigError: for settings that are not usable.
+    """
+    if shared and not shareable(config):
+        raise ConfigError("shared_table", True, f"false with policy {config.policy}")
+    host = HostSettings(**declare_settings(node, HostSettings))
+    priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
+    if host.mode == names.MODES[0]:
+        agents: AgentsNode = SwarmNode(node, with_key(make_swarm(config, local=ids, shared_table=shared)), space)
+    else:
+        agents = _realtime(node, config, ids, space, priority)
+    if host.odometry:
+        agents.offer_odometry(spaces)
+    logger = node.get_logger()
+    try:
+        check_parameters(node)
+        agents.run(stop)
+        logger.info(f"ends after slot {agents.slot}: {'stopped by a signal' if stop else 'the run is over'}")
+    except DtsaError as error:
+        logger.error(f"ends after slot {agents.slot}: {error}")
+        raise
+    finally:
+        agents.membership.close()
+        agents.loop.close()
+
+
+def _realtime(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, priority: int) -> AgentsNode:
+    from .realtime import ClockMap, RealtimeNode
+
+    def whole_numbers(name: str, count: int, text: str) -> list[int]:
+        values = declare_list(node, name, [0], text)
+        if len(values) not in (1, count):
+            raise ConfigError(name, values, f"{count} whole numbers, or one for all")
+        return values * (count if len(values) == 1 else 1)
+
+    count = len(ids)
+    text = "offset of each agent's clock at the start, one for all or one an agent; positive: early (ns)"
+    offset = whole_numbers("clock_offset_ns", count, text)
+    drift = whole_numbers("clock_drift_ppb", count, "by how much each agent's clock runs fast (parts per billion)")
+    own = RealtimeSettings(**declare_settings(node, RealtimeSettings))
+    text = "from the order to send until a receiver has the frame: for any frame, and more for each of its bytes (ns)"
+    fixed, per_byte = whole_numbers("flight_time_ns", 2, text)
+    text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
+    places = declare_list(node, "resume_at", [0.0], text)
+    if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):
+        raise ConfigError("resume_at", places, f"{3 * count} numbers with a decimal point: x, y, z of each agent")
+    if own.nice:
+        give_way_by(own.nice)
+    return RealtimeNode(
+        node,
+        config,
+        ids,
+        space,
+        authenticator=authenticator(config),
+        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)],
+        jitter_ns=own.clock_jitter_ns,
+        align=own.align,
+        flight_time_ns=fixed + per_byte * config.frame_length,
+        priority=priority,
+        resume_at=places if len(places) > 1 else (),
+    )
 
 
 def _body(stop: Stop, supervised: bool) -> None:
     node, space = swarm_wide_node("swarm_host", node_options(supervised))
     with ending(node):
         config = declare_swarm(node)
-        listed = ParameterDescriptor(
-            description="ids of the agents in this process; [0]: all",
-            read_only=True,
-            type=ParameterType.PARAMETER_INTEGER_ARRAY,
-        )
-        ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
-        shared = declare_setting(node, SHARED)
-        host_agents(node, parse_ids(ids, config.agents), config, stop, space, shared)
+        ids = declare_ids(node, config.agents)
+        host_agents(node, ids, config, stop, space, declare_setting(node, _SHARED))
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -14,11 +14,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Report, Slot, Transmission
 from rclpy.serialization import deserialize_message, serialize_message
 
-from dtsa_agent.ros.common.wire import report_fields
-from dtsa_agent.ros.common.wire.report_fields import ReportFields, pack_report, read_report
-from dtsa_agent.ros.common.wire.slot_fields import SlotFields, _fields, _read_usual, read_slot
-from dtsa_agent.ros.common.wire.stamps import header_of, ns_of
-from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, pack_transmission, read_transmission
+from dtsa_agent.ros.common.wire.messages import REPORT, SLOT, TRANSMISSION, Fields, MessageType, header_of, read_report
 
 MOST, STEPS = 12, 2
 words, stamps = st.integers(0, 2**32 - 1), st.integers(-(2**60), 2**60)
@@ -69,15 +65,13 @@ def reports(draw: Any) -> Report:
     return Report(header=header_of(draw(stamps)), run=draw(words), steps=draw(VALUES["B"]), **fields)
 
 
-def told_by(fields: ReportFields) -> list[Any]:
-    """All values of a report, as what can be compared: arrays may hold values that are no numbers."""
-    return [value if isinstance(value, int) else value.tobytes() for value in fields]
+def values_of(fields: Fields) -> list[Any]:
+    """All values of a message, as what can be compared: arrays may hold values that are no numbers."""
+    return [value if isinstance(value, int) else bytes(value) for value in fields]
 
 
-def fields_of(message: Transmission) -> TransmissionFields:
-    values = {name: getattr(message, name) for name in TransmissionFields._fields[4:]}
-    told = {name: value.tobytes() for name, value in values.items()}
-    return TransmissionFields(ns_of(message.header.stamp), message.run, message.slot, message.agent, **told)
+def type_of(message: Transmission | Slot | Report) -> MessageType:
+    return {Transmission: TRANSMISSION, Slot: SLOT, Report: REPORT}[type(message)]
 
 
 def damaged(data: bytes, cut: int, at: int, value: int) -> bytes:
@@ -86,29 +80,25 @@ def damaged(data: bytes, cut: int, at: int, value: int) -> bytes:
     return bytes(changed[: len(data) - cut])
 
 
-@given(transmissions())
-def test_transmissions(message: Transmission) -> None:
-    told = fields_of(message)
-    assert read_transmission(bytes(serialize_message(message)), STEPS) == told
-    packed = pack_transmission(told, STEPS)
-    assert deserialize_message(packed, Transmission) == message
-    assert read_transmission(packed, STEPS) == told
+@given(transmissions() | slots() | reports())
+def test_messages_are_read_and_packed_as_by_rclpy(message: Transmission | Slot | Report) -> None:
+    kind, data = type_of(message), bytes(serialize_message(message))
+    assert kind.read(data) is not None
+    fields = kind.read_fields(data)
+    assert values_of(fields) == values_of(kind.fields_of(message))
+    packed = kind.pack(fields.time_ns, [v if isinstance(v, int) else bytes(v) for v in fields[1:]])
+    assert kind.read(packed) is not None
+    assert deserialize_message(packed, type(message)) == message
+    assert kind.read_fields(packed) == fields
 
 
 @given(reports())
-def test_reports(message: Report) -> None:
-    found, by_rclpy = read_report(bytes(serialize_message(message))), report_fields._fields(message)
-    assert told_by(found) == told_by(by_rclpy)
-    rows = {name: value.tobytes() for name, value in found._asdict().items() if not isinstance(value, int)}
-    packed = pack_report(found.time_ns, found.run, found.steps, rows)
-    assert report_fields._read_usual(packed) is not None
-    assert deserialize_message(packed, Report) == message
-
-
-@given(slots())
-def test_slots(message: Slot) -> None:
-    data = bytes(serialize_message(message))
-    assert _read_usual(data) == read_slot(data) == _fields(message)
+def test_arrays_of_a_report(message: Report) -> None:
+    fields = read_report(bytes(serialize_message(message)))
+    for name in REPORT.fields:
+        value, expected = getattr(fields, name), getattr(message, name)
+        if not isinstance(expected, int):
+            assert (value.itemsize, value.tobytes()) == (expected.itemsize, expected.tobytes())
 
 
 places, bits = st.integers(0, 10_000), st.integers(0, 255)
@@ -116,26 +106,16 @@ places, bits = st.integers(0, 10_000), st.integers(0, 255)
 
 @given(transmissions() | slots() | reports(), st.integers(0, 40) | st.just(0), places, bits)
 def test_what_is_damaged_is_read_alike(message: Transmission | Slot | Report, cut: int, at: int, value: int) -> None:
-    data = damaged(bytes(serialize_message(message)), cut, at, value)
-    found: TransmissionFields | SlotFields | None
-    if isinstance(message, Report):
-        report = report_fields._read_usual(data)
-        if report is not None:
-            assert told_by(report) == told_by(report_fields._fields(deserialize_message(data, Report)))
-    elif isinstance(message, Slot):
-        found = _read_usual(data)
-        assert found is None or found == _fields(deserialize_message(data, Slot))
-    else:
-        found = read_transmission(data, STEPS)
-        assert found is None or found == fields_of(deserialize_message(data, Transmission))
+    data, kind = damaged(bytes(serialize_message(message)), cut, at, value), type_of(message)
+    if kind.read(data) is not None:
+        assert values_of(kind.read_fields(data)) == values_of(kind.fields_of(deserialize_message(data, type(message))))
 
 
 def test_what_is_laid_out_in_another_way_is_left_to_rclpy() -> None:
     message = Slot(slot=7, data=[1, 2])
     message.header.frame_id = "elsewhere"
     data = bytes(serialize_message(message))
-    assert _read_usual(data) is None
-    assert read_slot(data) == _fields(message)
-    assert read_transmission(data, STEPS) is None
+    assert SLOT.read(data) is TRANSMISSION.read(data) is None
+    assert SLOT.read_fields(data) == SLOT.fields_of(message)
     with pytest.raises(Exception, match="deserialize"):
-        read_slot(data[:30])
+        SLOT.read_fields(data[:30])

@@ -10,16 +10,16 @@ import pytest
 pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.ros.common.wire.report_fields import ReportFields, read_report
+from dtsa_agent.ros.common.wire.messages import Fields, read_report
 from dtsa_agent.ros.reporter import Reporter
 
 CONFIG = SwarmConfig(agents=12, slot_ms=10.0)
 IDS = (2, 5, 11)
 
 
-def make_reporter() -> tuple[Reporter, list[ReportFields]]:
+def make_reporter() -> tuple[Reporter, list[Fields]]:
     """One that publishes into a list."""
-    reports: list[ReportFields] = []
+    reports: list[Fields] = []
     return Reporter(SimpleNamespace(publish=lambda data: reports.append(read_report(data))), CONFIG, IDS), reports
 
 

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     make_scenario(config.swarm)
     picture = None if args.picture is None else _checked(Path(args.picture))
     directory = None if args.out is None else new_directory(args.out)
-    flight = simulate(config, trace=picture is not None)
+    flight = simulate(config, log=picture is not None)
     summary = flight.summary()
     text = json.dumps(summary, indent=2) + "\n"
     if directory is not None:
@@ -74,11 +74,11 @@ def _checked(picture: Path) -> Path:
 def _draw(picture: Path, flight: Flight, summary: dict[str, Any]) -> None:
     from dtsa_bench.drawing import optional_picture
 
-    assert flight.trace is not None
+    assert flight.log is not None
     with optional_picture(picture):
         from dtsa_bench.drawing.flight_paths import draw_flight
 
-        draw_flight(picture, flight.scenario, flight.trace.positions(), summary)
+        draw_flight(picture, flight.scenario, flight.log.positions(), summary)
         print(f"picture: {picture}", file=sys.stderr)
 
 

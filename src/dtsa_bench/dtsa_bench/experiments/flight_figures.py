@@ -21,12 +21,13 @@ TRUE, ESTIMATED, RECEIVED = palette.SERIES[2], INK, palette.SERIES[4]
 
 
 def _flights(table: SweepTable, spec: Spec) -> list[tuple[str, Flight]]:
-    """One flight of the first seed for each level of ``facets``, flown again with a trace."""
+    """One flight of the first seed for each level of ``facets``, flown again with a log."""
     facets = table.levels(spec["facets"])
     groups = [table.where(**{spec["facets"]: facet})[0] for facet in facets]
     seed = table.sweep.seeds[0]
     return [
-        (str(facet), simulate(group.cell.run(seed), trace=True)) for facet, group in zip(facets, groups, strict=True)
+        (str(facet), simulate(group.cell.run(seed), log=True, observer=1))
+        for facet, group in zip(facets, groups, strict=True)
     ]
 
 
@@ -39,8 +40,8 @@ def trajectories(table: SweepTable, spec: Spec) -> Figure:
     flights = _flights(table, spec)
     figure, axes = panels(len(flights), width=3.3, height=3.6)
     for axis, (name, flight) in zip(axes, flights, strict=True):
-        assert flight.trace is not None
-        paint(axis, flight.trace.positions(), flight.scenario.moving, ids=False)
+        assert flight.log is not None
+        paint(axis, flight.log.positions(), flight.scenario.moving, ids=False)
         axis.set_aspect("equal", "datalim")
         summary = flight.summary()
         time = summary["completion_time_s"]
@@ -61,14 +62,14 @@ def estimate(table: SweepTable, spec: Spec) -> Figure:
     first, last = _busiest(flights[0][1])
     errors = axes[-1]
     for number, (axis, (name, flight)) in enumerate(zip(axes[:-1], flights, strict=True)):
-        assert flight.trace is not None
+        assert flight.log is not None
         seen = int(_movers(flight)[-1])
         steps = flight.run.swarm.steps
-        window = slice(min(first, len(flight.trace.senders) - 2), last)
-        true = flight.trace.positions()[window.start * steps : window.stop * steps, :, seen]
-        believed = np.stack(flight.trace.estimates)[window, :, seen]
-        slots = np.stack(flight.trace.heard_slot)[window, seen]
-        received = np.stack(flight.trace.heard)[window, :, seen]
+        window = slice(min(first, len(flight.log) - 2), last)
+        true = flight.log.positions()[window.start * steps : window.stop * steps, :, seen]
+        believed = flight.log.estimate[window, :, seen]
+        slots = flight.log.heard_slot[window, seen]
+        received = flight.log.heard_position[window, :, seen]
         new = np.flatnonzero(np.diff(slots, prepend=slots[0]))
         error = np.linalg.norm(believed - true[steps - 1 :: steps][: len(believed)], axis=1)
         lines = [
@@ -100,9 +101,9 @@ def estimate(table: SweepTable, spec: Spec) -> Figure:
 
 def _busiest(flight: Flight, length: int = 160) -> tuple[int, int]:
     """The slots in which the shown mover turns most."""
-    assert flight.trace is not None
+    assert flight.log is not None
     seen = int(_movers(flight)[-1])
-    path = flight.trace.positions()[flight.run.swarm.steps - 1 :: flight.run.swarm.steps, :, seen]
+    path = flight.log.positions()[flight.run.swarm.steps - 1 :: flight.run.swarm.steps, :, seen]
     bend = np.linalg.norm(np.diff(path, n=2, axis=0), axis=1)
     length = min(length, len(bend))
     sums = np.convolve(bend, np.ones(length), mode="valid")

@@ -149,12 +149,12 @@ def fly(task: Task) -> tuple[str, Row]:
     from dtsa_bench.simulation.simulate import simulate
 
     cell, scheme = task.settings["cell"], task.settings["scheme"]
-    flight = simulate(run_config(league(task.settings["league"]).settings(cell, scheme, task.seed)), trace=True)
-    summary, trace = flight.summary(), flight.trace
-    assert trace is not None
-    digest = hashlib.sha256(json.dumps([list(map(int, ids)) for ids in trace.senders]).encode())
-    digest.update(bytes(trace.outcomes))
-    digest.update(np.ascontiguousarray(trace.positions(), dtype="<f8").tobytes())
+    flight = simulate(run_config(league(task.settings["league"]).settings(cell, scheme, task.seed)), log=True)
+    summary, log = flight.summary(), flight.log
+    assert log is not None
+    digest = hashlib.sha256(json.dumps([list(ids) for ids in log.senders()]).encode())
+    digest.update(log.outcome.tobytes())
+    digest.update(log.position.astype("<f8", copy=False).tobytes())
     known = {**summary, "slots": summary["slots"]["total"], "digest": digest.hexdigest()[:16]}
     return summary["end"], {name: known[name] for name in FIELDS[1:]}
 

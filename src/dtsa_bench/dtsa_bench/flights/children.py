@@ -93,11 +93,6 @@ class Children:
         if ended:
             raise NodeError("; ".join(describe_end(child) for child in ended))
 
-    @property
-    def killed(self) -> bool:
-        """Whether a signal has ended one of them, in whatever it was doing."""
-        return any((child.process.returncode or 0) < 0 for child in self.all)
-
     def stop(self, hurry: bool = False) -> list[str]:
         """Waits until all have ended, and helps those that do not."""
         helped: dict[str, None] = {}

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.ros.common.workarounds.dds import RANGE, clean_shared_memory
+from dtsa_agent.ros.common.workarounds.dds import RANGE
 
 # Ports of RTPS: 7400 + 250 domain + 10 + 2 participant (+ 1). Beyond domain 101 they meet Linux's ephemeral ports.
 LAST_FREE_DOMAIN = 101
@@ -39,7 +39,7 @@ def clear_hindrances(environment: MutableMapping[str, str]) -> None:
 
 @contextmanager
 def ros_domain(wanted: int | None = None, *, shared: bool = False) -> Iterator[int]:
-    """Takes a domain for as long as the context lasts, and removes what dead processes have left in shared memory.
+    """Takes a domain for as long as the context lasts.
 
     :param wanted: number of the domain, 0 to 232; None: any that is free.
     :raises ConfigError: if the wanted one is in use.
@@ -57,11 +57,7 @@ def ros_domain(wanted: int | None = None, *, shared: bool = False) -> Iterator[i
             continue
         try:
             if shared or _ports_free(domain):
-                clean_shared_memory()
-                try:
-                    yield domain
-                finally:
-                    clean_shared_memory()
+                yield domain
                 return
         finally:
             os.close(lock)

@@ -12,8 +12,7 @@ This module owns the order in which a flight ends; each step is elsewhere, and h
    the user 0.3 s each.
 5. **The results:** summary and picture, from the metrics of this process; no picture after an early end. Then an error
    of the flight is raised.
-6. **The node** of this process is destroyed last of all, and its ROS context after it. Where a process was killed the
-   node is kept instead: the dead one may hold locks of the middleware.
+6. **The node** of this process is destroyed last of all, and its ROS context after it.
 
 In :func:`fly` all of it happens however the flight ends. If a call into a library stands still after a signal, `Stop`
 ends this process after its patience, with the place of each thread.
@@ -47,7 +46,6 @@ from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import init_ros
 from dtsa_agent.ros.common.process.priority import give_way_by, take_place, take_priority
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
-from dtsa_agent.ros.common.workarounds.kept_nodes import keep_node
 from dtsa_agent.stop import StopToken
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.metrics import may_share
@@ -74,19 +72,18 @@ ENVIRONMENT = {
 
 # The log of this process's nodes goes to /rosout alone: the progress line tells the same here.
 QUIET = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
-MOST_SHARED = 32  # processes; where 70 share memory, they wait for each other's ports for minutes
 
 END_S = 1.0  # wall time in which the nodes are to hear of the end; those that have not are ended then
 
 
-def run_environment(domain: int, logs: Path, shared_memory: bool = True) -> dict[str, str]:
+def run_environment(domain: int, logs: Path) -> dict[str, str]:
     """Variables for the processes of a run; this process gets those that its own node needs.
 
     :param logs: directory for ROS's logs.
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    limit_to_machine(os.environ, shared_memory)
+    limit_to_machine(os.environ)
     os.environ["ROS_LOG_DIR"] = str(logs.resolve())
     return {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs.resolve())}
 
@@ -161,8 +158,7 @@ def fly(
         directory = new_directory(out)
         (directory / "log").mkdir()
         context = Context()
-        few = (options.processes or run.swarm.agents) <= MOST_SHARED
-        environment = run_environment(domain, directory / "log", shared_memory=few and run.mode == LOCKSTEP)
+        environment = run_environment(domain, directory / "log")
         children = Children(directory / "log", environment)
         progress = progress or ProgressLine(label)
         try:
@@ -228,11 +224,8 @@ def _fly(
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         # Last of all (6): the middleware may stand still for ever if others leave in the same moment.
-        if failure is None and not children.killed:
-            with stop.in_time():
-                node.destroy_node()
-        else:
-            keep_node(node)  # who was killed may have left locks behind
+        with stop.in_time():
+            node.destroy_node()
 
 
 def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: FlightProgress, priority: int) -> None:

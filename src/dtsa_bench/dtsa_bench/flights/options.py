@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import check, setting
-from dtsa_channel_sim.ros.answer_limits import AnswerLimits
+from dtsa_channel_sim.model.config import AnswerLimits
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,18 +17,16 @@ from dtsa_agent.core.settings.config import agreed_settings
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings, swarm_wide_node
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import run_node
+from dtsa_agent.ros.common.process.node_process import ending, run_node
 from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
 from dtsa_agent.ros.common.process.runs import Run
-from dtsa_agent.ros.common.workarounds.kept_nodes import ending
 from dtsa_bench.drawing import optional_picture
 from dtsa_bench.runs.config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.options import new_directory
 from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig
-from dtsa_channel_sim.ros.answer_limits import AnswerLimits
+from dtsa_channel_sim.model.config import AnswerLimits
 from dtsa_channel_sim.ros.channel_node import follow_parameters, watch
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel

@@ -16,9 +16,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
+from dtsa_agent.ros.common.wire.messages import Fields, ns_of
 from dtsa_agent.ros.common.wire.packing import pack_received
-from dtsa_agent.ros.common.wire.report_fields import ReportFields
-from dtsa_agent.ros.common.wire.stamps import ns_of
 from dtsa_bench.log.bag.cdr import CdrBuilder, OdometryPacker
 from dtsa_bench.log.bag.metadata import RUN_ID
 from dtsa_bench.log.bag.writer import BagWriter
@@ -82,7 +81,7 @@ class FlightRecorder(ChannelObserver):
             start_ns = ns_of(message.header.stamp) - names.TIME_ZERO_NS
             self._accounts.add_frame(message.slot, message.agent, bytes(message.data), start_ns)
 
-    def report(self, message: ReportFields, data: bytes) -> None:
+    def report(self, message: Fields, data: bytes) -> None:
         if self._accounts is not None:
             self._accounts.add_report(message)
 
@@ -223,7 +222,7 @@ class RealtimeAccounts:
                 lost, collided = (values[row] for values in (verdict.lost or nothing, verdict.collided or nothing))
                 waiting.popleft().verdict = mask[row], lost, collided
 
-    def add_report(self, message: ReportFields) -> None:
+    def add_report(self, message: Fields) -> None:
         """Agents of one process report slots, and what they took in."""
         at, count = np.array(message.agent, np.intp) - 1, len(message.agent)
         for row, slot in enumerate(message.slot.tolist()):

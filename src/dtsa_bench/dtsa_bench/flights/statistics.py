@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dtsa_agent.core.agents.delays import Delays
-from dtsa_agent.ros.common.wire.report_fields import ReportFields
+from dtsa_agent.ros.common.wire.messages import Fields
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver
@@ -133,7 +133,7 @@ class ClockStatistics(ChannelObserver):
         self._last_spreads: deque[float] = deque(maxlen=_END)  # ns
         self._away: dict[int, _Sends] = {}  # by agent
 
-    def report(self, message: ReportFields, data: bytes) -> None:
+    def report(self, message: Fields, data: bytes) -> None:
         self.add(message.slot, message.agent, message.offset_ns, message.length)
 
     def add(

@@ -13,10 +13,9 @@ from rclpy.parameter import Parameter
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.station import check_joinable
 from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.workarounds.dds import clean_shared_memory
-from dtsa_channel_sim.ros.attendance import LOST_AFTER_S
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+from dtsa_channel_sim.ros.roster import LOST_AFTER_S
 
 from .children import Child, Children, NodeError, describe_end
 from .measurement import FlightMeasurement
@@ -89,7 +88,6 @@ class RealtimeSupervisor(ChannelObserver):
         :raises NodeError: when nobody is left.
         """
         left = not child.process.returncode
-        clean_shared_memory()  # before anybody takes the dead one's port for a living one's
         self._say(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
         for agent in child.agents:
             self._channel.lose(agent)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, make_scenario
+from dtsa_agent.core.kernel import lib
 from dtsa_agent.core.plugins.entry_points import PluginSwarm
 from dtsa_agent.core.plugins.table import Table
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS
@@ -22,7 +23,7 @@ from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import COMPLETED, CRASHED, FlightMetrics
 from dtsa_channel_sim import OUTCOMES, Channel
 
-from .slotted import SlottedTraffic
+from .simulate import complete_slot
 
 try:
     from gymnasium.spaces import Box, Discrete
@@ -35,7 +36,7 @@ POLICY = "actions"  # what the setting `policy` says in an environment
 OWN = {"slot": (0, 1), "turn_in": (1, 1), "frame": (2, 1), "far": (3, 1), "goal": (4, 3), "velocity": (7, 3)}
 #: Planes of N numbers, one an agent, by name: first plane and count.
 PLANES = {"age": (0, 1), "silence": (1, 1), "moves": (2, 1), "position": (3, 3), "relative_velocity": (6, 3)}
-_OWN_SIZE, _PLANE_COUNT = 10, 9
+_OWN_SIZE, _PLANE_COUNT = lib.SWARM_OBSERVED_OWN, lib.SWARM_OBSERVED_PLANES
 
 
 def fields(observations: NDArray[np.float32], agents: int) -> dict[str, NDArray[np.float32]]:
@@ -61,7 +62,7 @@ class Observer:
     """
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
-        self._config, self._index = config, np.array([agent - 1])
+        del config, agent
 
     def __call__(self, table: Table, slot: int) -> NDArray[np.float32]:
         """(F,) what the agent has heard before a slot.
@@ -69,43 +70,7 @@ class Observer:
         :param table: what ``choose`` was given.
         :param slot: the slot that begins.
         """
-        tables = (table.sent_slot, table.last_turn, table.in_ap, table.sent_position, table.sent_velocity)
-        own = (table.own_position, table.own_velocity, table.goal)
-        heard = [known[None] for known in tables], [np.asarray(state)[:, None] for state in own]
-        return observe(self._config, self._index, slot, *heard)[0]
-
-
-def observe(
-    config: SwarmConfig, index: NDArray[np.intp], slot: int, tables: list[NDArray[Any]], states: list[NDArray[Any]]
-) -> NDArray[np.float32]:
-    """(V, F) observations of V observers.
-
-    :param index: (V,) their ids less one.
-    :param slot: the slot that begins.
-    :param tables: sent_slot, last_turn, in_ap (V, N), sent_position and sent_velocity (V, 3, N).
-    :param states: own position, velocity and goal (3, V).
-    """
-    agents = config.agents
-    order = (index[:, None] + np.arange(agents)) % agents  # each has itself first, then those with the next ids
-    sent, turn, in_ap, place, speed = (
-        np.take_along_axis(known, order if known.ndim == 2 else order[:, None], axis=-1) for known in tables
-    )
-    position, velocity, goal = (state.T for state in states)
-    ago = np.where(sent < 0, 0, slot - sent)  # an agent that was never heard has not moved
-    observations = np.empty((len(index), _OWN_SIZE + _PLANE_COUNT * agents), dtype=np.float32)
-    out = fields(observations, agents)
-    out["slot"][...] = slot
-    out["turn_in"][...] = (index - slot) % agents
-    out["frame"][...] = (sent == slot - 1).any(axis=1) & (slot > 0)
-    out["goal"][...] = way = goal - position
-    out["far"][...] = np.sqrt((way * way).sum(axis=1)) > config.r_min
-    out["velocity"][...] = velocity
-    out["age"][...] = ago - 1
-    out["silence"][...] = slot - 1 - turn
-    out["moves"][...] = in_ap
-    out["position"][...] = place + speed * (ago * config.slot_s)[:, None] - position[..., None]
-    out["relative_velocity"][...] = speed - velocity[..., None]
-    return observations
+        return table.observation(slot)
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +196,7 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         self.slot = 0  # the one that begins
         self.senders: tuple[int, ...] = ()  # ids, of the last slot
         self.outcome = 0  # of the last slot, index into OUTCOMES
-        self._carry = SlottedTraffic(self.swarm, Channel(run.air)).slot
+        self._channel, self._length = Channel(run.air), run.swarm.frame_length
         self.scenario.advance(0, self.swarm)
         self.agents = self.possible_agents[:]
         return self._observations(), {agent: {} for agent in self.agents}
@@ -250,18 +215,18 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         for agent in names:
             if agent not in actions or actions[agent] not in (0, 1):
                 raise ConfigError(f"actions of {agent}", actions.get(agent), "0 or 1")
-        sent = np.array([actions[agent] for agent in names], dtype=np.bool_) & (swarm.present > 0)
+        sent = np.fromiter((actions[agent] for agent in names), np.bool_, len(names)) & (swarm.present > 0)
         swarm.sends[...] = sent
         swarm.chosen[...] = np.where(sent, swarm.ids, 0)  # a silent agent says nothing of whom it takes for the sender
         senders, woken = swarm.emit(slot), self.metrics.woken.copy()
         self.metrics.compare_tables(slot, swarm.table_hash, swarm.chosen)
-        verdict, lengths = self._carry(slot, senders)
-        over = self.metrics.update(slot, swarm.track, swarm, verdict.outcome, lengths)
+        verdict, over = complete_slot(swarm, self._channel, self.metrics, slot, senders, self._length)
         self.slot, self.senders, self.outcome = slot + 1, verdict.senders, verdict.outcome
-        known = np.where(swarm.sent_slot >= woken, swarm.sent_slot, woken - 1)
-        counts = self.scenario.moving & (woken >= 0) & ~np.eye(len(names), dtype=np.bool_)
+        known = np.maximum(swarm.sent_slot, woken - 1)  # of nobody since it has woken: the slot before
+        ages = np.where(self.scenario.moving & (woken >= 0), slot - known, -1)
+        np.fill_diagonal(ages, -1)
         results = SlotResults(
-            slot, sent, OUTCOMES[verdict.outcome], np.where(counts, slot - known, -1),
+            slot, sent, OUTCOMES[verdict.outcome], ages,
             self.metrics.crash_slot == self.slot, over == COMPLETED, swarm.position,
         )  # fmt: skip
         worth = np.asarray(self._reward(results), dtype=np.float64)
@@ -280,10 +245,7 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         return self._observations(), rewards, *flags, {agent: dict(info) for agent in names}
 
     def _observations(self) -> dict[str, NDArray[np.float32]]:
-        swarm, index = self.swarm, np.arange(len(self.possible_agents))
-        tables = [swarm.sent_slot, swarm.last_turn, swarm.in_ap, swarm.sent_position, swarm.sent_velocity]
-        states = [swarm.position, swarm.velocity, swarm.goal]
-        return dict(zip(self.possible_agents, observe(self.run.swarm, index, self.slot, tables, states), strict=True))
+        return dict(zip(self.possible_agents, self.swarm.observations(self.slot), strict=True))
 
     def render(self) -> str | None:
         """A line on the last slot, which mode ``human`` prints."""

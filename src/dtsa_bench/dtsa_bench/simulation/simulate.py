@@ -7,45 +7,25 @@ for bit.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dtsa_agent.core import Scenario, Swarm, make_scenario
+from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_bench.log.arrays import LogBuilder
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics, may_share
-from dtsa_channel_sim import Channel
+from dtsa_channel_sim import Channel, Verdict
+from dtsa_channel_sim.model.verdict import SUCCESS
 
-from .slotted import SlottedTraffic
+from .slot_arrays import SlotArrays, SlotWriter
 from .unslotted import UnslottedTraffic
 
-Array = NDArray[np.float64]
-
-
-@dataclass(slots=True)
-class Trace:
-    """What happened in every slot, for tests and figures; S control instants a slot, N agents."""
-
-    senders: list[tuple[int, ...]] = field(default_factory=list)  # ids
-    outcomes: list[int] = field(default_factory=list)
-    reasons: list[int] = field(default_factory=list)  # index into REASONS, of ``observer``
-    chosen: list[int] = field(default_factory=list)  # id that ``observer`` took for the sender, 0: nobody
-    scores: list[float] = field(default_factory=list)  # priority g of that one, 0 without one
-    tracks: list[Array] = field(default_factory=list)  # (S, 3, N) m, frame map, true positions
-    estimates: list[Array] = field(default_factory=list)  # (3, N) m, of ``observer`` for the start of the next slot
-    heard: list[Array] = field(default_factory=list)  # (3, N) m, last received positions of ``observer``
-    heard_slot: list[NDArray[np.int64]] = field(default_factory=list)  # (N,) the slots they are from, -1: never
-    in_ap: list[NDArray[np.uint8]] = field(default_factory=list)  # (N,) A_p of ``observer``
-
-    def positions(self) -> Array:
-        """True positions at all control instants, (T, 3, N), m, frame map."""
-        return np.concatenate(self.tracks)
+_CALL_S = 0.02  # a call of C takes about so long: after it, Ctrl-C works
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +36,9 @@ class Flight:
     scenario: Scenario
     metrics: FlightMetrics
     swarm: Swarm  # as it was at the end
-    trace: Trace | None
+    log: SlotArrays | None  # what happened in its slots
     wall_time_s: float
-    log: FlightLog | None = None
+    unslotted: LogBuilder | None = None  # the same of agents that send at any instant
 
     def summary(self) -> dict[str, Any]:
         """The results, with the keys of ``summary.json``."""
@@ -66,79 +46,99 @@ class Flight:
         result["malformed"], result["foreign"] = self.swarm.malformed, self.swarm.foreign
         return result
 
+    def flight_log(self) -> FlightLog:
+        """The flight as users have it; without its slots if it was flown without `log` and `frames`."""
+        if self.unslotted is not None:
+            return FlightLog(**self.unslotted.fields(self.swarm.track), results=self.summary())
+        fields = LogBuilder(self.run).fields(self.swarm.track)
+        if self.log is not None:
+            fields |= self.log.log_fields(self.scenario.start, self.run.swarm.slot_ns)
+        return FlightLog(**fields, results=self.summary(), is_kept=self.log is not None)
+
 
 def simulate(
     run: RunConfig,
     *,
     shared_table: bool | None = None,
-    trace: bool = False,
-    observer: int = 1,
     log: bool = False,
+    frames: bool = False,
+    observer: int = 0,
 ) -> Flight:
     """Flies one run.
 
     :param run: the run.
     :param shared_table: one table for all agents; None: where :func:`may_share` allows it.
-    :param trace: keep what happened in every slot.
-    :param observer: id whose table the trace follows.
-    :param log: keep what happened to all agents in every slot.
+    :param log: keep what happened in every slot.
+    :param frames: keep the bytes of frames in it, too.
+    :param observer: id of the agent whose knowledge the log has; 0: none.
     """
     begun = time.perf_counter()
     scenario = make_scenario(run.swarm)
     shared = may_share(run) if shared_table is None else shared_table
-    kept = Trace() if trace else None
     swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared))
+    writer = SlotWriter(swarm, observer, frames) if log else None
     metrics = FlightMetrics(run, scenario)
-    fly = _fly_unslotted if run.swarm.policy_row.unslotted else _fly
-    builder = LogBuilder(run) if log else None
-    fly(swarm, Channel(run.air), metrics, kept, observer, builder)
-    flight = Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
-    return (
-        flight
-        if builder is None
-        else replace(flight, log=FlightLog(**builder.fields(swarm.track), results=flight.summary()))
-    )
+    builder = LogBuilder(run) if log and run.swarm.policy_row.unslotted else None
+    if run.swarm.policy_row.unslotted:
+        _fly_unslotted(swarm, Channel(run.air), metrics, writer, builder)
+    else:
+        _fly(swarm, Channel(run.air), metrics, writer)
+    arrays = None if writer is None else writer.finish()
+    return Flight(run, scenario, metrics, swarm, arrays, time.perf_counter() - begun, builder)
 
 
-def _fly(
-    swarm: Swarm,
-    channel: Channel,
-    metrics: FlightMetrics,
-    kept: Trace | None,
-    observer: int,
-    log: LogBuilder | None,
-) -> None:
-    """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
-    advance, begin, update = swarm.scenario.advance, swarm.begin, metrics.update
-    carry, track = SlottedTraffic(swarm, channel).slot, swarm.track
-    table = 0 if swarm.shared else observer - 1
-    compare = None if swarm.shared else metrics.compare_tables  # one table cannot differ from itself
-    slot = 0
-    while True:
-        advance(slot, swarm)
-        senders = begin(slot)
-        if compare is not None:
-            compare(slot, swarm.digest, swarm.chosen)
-        if log is not None:
-            log.open(swarm, {swarm.ids[index]: swarm.frame(index) for index in senders})
-        verdict, lengths = carry(slot, senders)
-        if log is not None:
-            log.close(verdict)
-        over = update(slot, track, swarm, verdict.outcome, lengths)
-        if kept is not None:
-            _keep(kept, swarm, slot, verdict.senders, verdict.outcome, table)
-        if over:
-            return
-        slot += 1
+def complete_slot(
+    swarm: Swarm, channel: Channel, metrics: FlightMetrics, slot: int, senders: Sequence[int], length: int
+) -> tuple[Verdict, str]:
+    """Carry the frames of a slot, which are encoded already, and close it.
+
+    :param senders: positions in ``ids`` of those that send.
+    :param length: bytes of each frame on the air.
+    :returns: the channel's verdict, and why the flight is over now, or "".
+    """
+    lengths = [length] * len(senders)
+    verdict = channel.arbitrate(slot, [swarm.ids[index] for index in senders], lengths, swarm.position)
+    swarm.complete(slot, senders, verdict.received, verdict.outcome == SUCCESS)
+    return verdict, metrics.update(slot, swarm.track, swarm, verdict.outcome, lengths)
+
+
+def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None) -> None:
+    """Fly slots until the flight is over: in C as far as agents and channel are built in and simple."""
+    flight, received = ffi.new("sim_flight *"), ffi.new("uint8_t[]", swarm.config.agents)
+    flight.swarm, flight.metrics, flight.received = swarm.kernel, metrics.kernel, received
+    flight.course = ffi.NULL if swarm.course is None else swarm.course.kernel
+    flight.log = ffi.NULL if log is None else log.kernel
+    metrics.use_arrays(swarm.track, swarm)
+    if swarm.course is None:
+        swarm.scenario.advance(0, swarm)  # once and for all
+    whole, length, count, until = swarm.all_in_c, swarm.config.frame_length, 1, 0
+    while not metrics.end:
+        slot = flight.slot
+        if whole and slot >= until:
+            until = channel.fill_losses(slot, flight.losses)
+        if slot < until:
+            if log is not None:
+                log.make_room()
+            begun = time.perf_counter()
+            lib.dtsa_sim_run(flight, min(count, until - slot))
+            spent = time.perf_counter() - begun
+            count = max(1, min(4 * count, int((flight.slot - slot) * _CALL_S / max(spent, 1e-6))))
+        else:
+            swarm.scenario.advance(slot, swarm)
+            senders = swarm.begin(slot)
+            if not swarm.shared:
+                metrics.compare_tables(slot, swarm.digest, swarm.chosen)
+            if log is not None:
+                log.open_slot()
+            verdict, _ = complete_slot(swarm, channel, metrics, slot, senders, length)
+            if log is not None:
+                log.close_slot(slot, verdict)
+            flight.slot = slot + 1
+    metrics.count_frames(length, metrics.kernel.frames)
 
 
 def _fly_unslotted(
-    swarm: Swarm,
-    channel: Channel,
-    metrics: FlightMetrics,
-    kept: Trace | None,
-    observer: int,
-    log: LogBuilder | None,
+    swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None, builder: LogBuilder | None
 ) -> None:
     """The same for agents that send at any instant: what arrives in a slot is heard in it."""
     traffic = UnslottedTraffic(swarm, channel)
@@ -146,32 +146,20 @@ def _fly_unslotted(
     while not over:
         swarm.scenario.advance(slot, swarm)
         carried = traffic.slot(slot)
-        metrics.compare_tables(slot, swarm.digest, swarm.chosen)
         heard = [*((slot, frame, mask) for frame, mask in carried.heard), *carried.combined]
-        if log is not None:
-            log.open(swarm, {agent: swarm.frame(agent - 1) for agent in carried.senders})
+        if log is not None and builder is not None:
+            log.open_slot()
+            builder.open(swarm, {agent: swarm.frame(agent - 1) for agent in carried.senders})
             for at, frame, mask in heard:
-                log.hear(at, frame, mask)
-            log.close_unslotted(carried.outcome, carried.senders, heard)
+                builder.hear(at, frame, mask)
+            builder.close_unslotted(carried.outcome, carried.senders, heard)
+        metrics.compare_tables(slot, swarm.digest, swarm.chosen)
         swarm.fly(slot)
         for at, frame, mask in heard:
             swarm.hear(at, frame, mask)
         swarm.end(slot)
         over = metrics.update(slot, swarm.track, swarm, carried.outcome, carried.lengths)
-        if kept is not None:
-            _keep(kept, swarm, slot, carried.senders, carried.outcome, observer - 1)
+        if log is not None:
+            nothing = (0,) * len(carried.senders)
+            log.close_slot(slot, Verdict(carried.outcome, carried.senders, None, nothing, nothing))
         slot += 1
-
-
-def _keep(kept: Trace, swarm: Swarm, slot: int, senders: tuple[int, ...], outcome: int, table: int) -> None:
-    kept.senders.append(senders)
-    kept.outcomes.append(outcome)
-    kept.reasons.append(int(swarm.reason[table]))
-    kept.chosen.append(int(swarm.chosen[table]))
-    kept.scores.append(float(swarm.score[table]))
-    kept.tracks.append(swarm.track.copy())
-    swarm.estimate(slot + 1)
-    kept.estimates.append(swarm.estimate_position[table].copy())
-    kept.heard.append(swarm.sent_position[table].copy())
-    kept.heard_slot.append(swarm.sent_slot[table].copy())
-    kept.in_ap.append(swarm.in_ap[table].copy())

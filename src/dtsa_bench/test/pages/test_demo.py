@@ -31,12 +31,12 @@ def flights() -> dict[str, FinishedFlight]:
     """The flights of the demo without nodes: in lockstep they are the same, bit for bit."""
     found = {}
     for flight in (flight for step in STEPS for flight in step if not flight.live):
-        flown = simulate(flight.run, trace=True)
-        assert flown.trace is not None
-        track = flown.trace.positions()[flight.run.swarm.steps - 1 :: flight.run.swarm.steps]
+        flown = simulate(flight.run, log=True, observer=1)
+        assert flown.log is not None
+        track = flown.log.positions()[flight.run.swarm.steps - 1 :: flight.run.swarm.steps]
         position = np.concatenate((flown.scenario.start[None], track))
-        error = np.linalg.norm(np.stack(flown.trace.estimates) - track, axis=1).mean(axis=1)
-        senders = tuple(flown.trace.senders)
+        error = np.linalg.norm(flown.log.estimate - track, axis=1).mean(axis=1)
+        senders = tuple(flown.log.senders())
         found[flight.key] = FinishedFlight(flight, flown.summary(), flown.scenario, senders, position, error)
     return found | {"killed-lease": killed()}
 

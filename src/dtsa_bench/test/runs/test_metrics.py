@@ -248,6 +248,6 @@ def test_frames_that_the_radio_does_not_take_are_refused(monkeypatch: pytest.Mon
 def test_in_slots_that_are_long_enough_the_radio_changes_no_flight(policy: str, loss: float) -> None:
     flown = []
     for radio in ("plain", "crazyflie"):
-        flight = simulate(run(radio, loss, policy=policy, slot_ms=2, seed=3, agents=6), trace=True)
-        flown.append((flight.trace.senders, flight.trace.outcomes, [track.tobytes() for track in flight.trace.tracks]))
+        flight = simulate(run(radio, loss, policy=policy, slot_ms=2, seed=3, agents=6), log=True)
+        flown.append((flight.log.senders(), flight.log.outcome.tobytes(), flight.log.position.tobytes()))
     assert flown[0] == flown[1]

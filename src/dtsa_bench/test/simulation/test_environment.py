@@ -94,12 +94,12 @@ def test_a_scripted_policy_flies_what_simulate_flies(policy: str, rule: Rule, se
 
     dtsa.register("estimator", "ahead", Ahead)
     settings = SHORT | settings
-    expected = simulate(dtsa.run_config(policy=policy, **settings), trace=True, shared_table=False)
+    expected = simulate(dtsa.run_config(policy=policy, **settings), log=True, shared_table=False)
     steps = flown(parallel_env(**settings), rule)
-    trace = expected.trace
-    assert [step[1] for step in steps] == trace.senders
-    assert [step[2] for step in steps] == trace.outcomes
-    np.testing.assert_array_equal(np.stack([step[3] for step in steps]), np.stack(trace.tracks))
+    log = expected.log
+    assert [step[1] for step in steps] == log.senders()
+    assert [step[2] for step in steps] == log.outcome.tolist()
+    np.testing.assert_array_equal(np.stack([step[3] for step in steps]), log.position)
     _, terminated, truncated, infos = steps[-1][4:]
     wanted = expected.summary()
     assert_same(infos["agent_1"]["summary"], wanted)
@@ -232,6 +232,6 @@ def test_the_examples_fly_tdma_and_as_they_were_trained(capsys: pytest.CaptureFi
     learned["cost"](first, swarm, 7, record)
     dtsa.register("policy", "learned", lambda config, agent: learned["Learned"](config, agent, first))
     run = dtsa.run_config(policy="learned", seed=7, **learned["COMMON"], **swarm)
-    trace = simulate(run, trace=True).trace
+    senders = simulate(run, log=True).log.senders()
     assert len(record) > 100
-    assert record == trace.senders[: len(record)]
+    assert record == senders[: len(record)]

@@ -41,13 +41,13 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def flight(**settings: Any) -> Any:
-    return simulate(spec.run_config({"agents": 6, "seed": 5, "timeout_s": 1.5, **settings}), trace=True)
+    return simulate(spec.run_config({"agents": 6, "seed": 5, "timeout_s": 1.5, **settings}), log=True, observer=1)
 
 
 def test_a_policy_of_ones_own_decides_who_sends() -> None:
     result = flight(policy="least-known")
-    assert {REASONS[code] for code in result.trace.reasons} == {"plugin"}
-    senders = result.trace.senders
+    assert {REASONS[code] for code in result.log.reason.ravel()} == {"plugin"}
+    senders = result.log.senders()
     assert senders[:6] == [(i,) for i in range(1, 7)]
     assert all(len(ids) == 1 for ids in senders)
     assert [ids[0] for ids in senders[10::10]] == [slot // 10 % 6 + 1 for slot in range(10, len(senders), 10)]
@@ -56,21 +56,21 @@ def test_a_policy_of_ones_own_decides_who_sends() -> None:
 def test_an_estimator_of_ones_own_feeds_avoider_and_metrics() -> None:
     linear, damped = (flight(estimator=name, policy="tdma") for name in ("linear", "damped"))
     quick = flight(estimator="damped", policy="tdma", options={"damped.rest_s": 0.05})
-    assert len({f.trace.positions().tobytes() for f in (linear, damped, quick)}) == 3
+    assert len({f.log.positions().tobytes() for f in (linear, damped, quick)}) == 3
     # Whoever is believed to stop at once is believed to be too far back.
     errors = [f.summary()["estimate_error_mean_m"] for f in (linear, damped, quick)]
     assert errors[0] < errors[1] < errors[2]
     swarm = quick.swarm
     age = (quick.metrics.slots - swarm.sent_slot[0]) * 0.01
     expected = swarm.sent_position[0] + swarm.sent_velocity[0] * age * (1 + 1 / (1 + age / 0.05)) / 2
-    np.testing.assert_allclose(quick.trace.estimates[-1], expected, atol=1e-12)
+    np.testing.assert_allclose(quick.log.estimate[-1], expected, atol=1e-12)
 
 
 def test_an_avoider_of_ones_own_flies() -> None:
     result = flight(avoider="give-way", timeout_s=20.0)
     assert result.summary()["end"] == "completed"
     assert flight_model("give-way").vehicle.tau == 0.1
-    speed = np.linalg.norm(np.diff(result.trace.positions(), axis=0), axis=1) / 0.01
+    speed = np.linalg.norm(np.diff(result.log.positions(), axis=0), axis=1) / 0.01
     assert 0.9 < speed.max() <= 1.0 + 1e-9
     straight = flight(
         avoider="none", timeout_s=20.0, options={"v_max": 1.0, "tau": 0.1, "spacing": 0.55, "min_radius": 1.8}
@@ -81,18 +81,19 @@ def test_an_avoider_of_ones_own_flies() -> None:
 def test_all_three_together_are_the_same_flight_every_time_and_with_single_agents() -> None:
     settings = {"policy": "least-known", "estimator": "damped", "avoider": "give-way", "timeout_s": 0.6}
     together = flight(**settings)
+    senders = together.log.senders()
     config = SwarmConfig(agents=6, seed=5, **{k: v for k, v in settings.items() if k != "timeout_s"})
     agents = [Agent(i, config) for i in range(1, 7)]
     for slot in range(60):
         frames = {agent.id: agent.on_slot(slot) for agent in agents}
         sent = {i: data for i, data in frames.items() if data}
-        assert tuple(sent) == together.trace.senders[slot]
+        assert tuple(sent) == senders[slot]
         for agent in agents:
             agent.swarm.fly(slot)
             for i, data in sent.items():
                 assert agent.id == i or agent.on_frame(data, slot)
         positions = np.concatenate([agent.swarm.position for agent in agents], axis=1)
-        assert np.array_equal(positions, together.trace.tracks[slot][-1])
+        assert np.array_equal(positions, together.log.position[slot, -1])
 
 
 @pytest.mark.ros
@@ -105,8 +106,8 @@ def test_nodes_find_plugins_too_and_agree_with_the_simulator(installed, tmp_path
     settings = {"agents": 4, "policy": "least-known", "estimator": "damped", "avoider": "give-way", "loss": 0.1}
     run = spec.run_config({**settings, "seed": 5, "timeout_s": 0.8})
     real = fly(run, tmp_path / "flight", FlightOptions(processes=2, pictures=False))
-    ours = simulate(run, trace=True)
-    ends = np.stack([track[-1] for track in ours.trace.tracks])
+    ours = simulate(run, log=True)
+    ends = ours.log.position[:, -1]
     assert len(real.positions) >= 80
     assert np.array_equal(real.positions[1:80], ends[:79])
 
@@ -303,9 +304,9 @@ def test_lots_and_estimates_are_the_same_in_nodes_processes_and_simulator_and_ve
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.syspath_prepend(str(tmp_path))
     run = spec.run_config({"agents": 4, "policy": policy, "loss": 0.1, "seed": 5, "timeout_s": 0.8})
-    ours = simulate(run, trace=True)
-    assert {len(ids) for ids in ours.trace.senders} >= {0, 1}
-    ends = np.stack([track[-1] for track in ours.trace.tracks])
+    ours = simulate(run, log=True)
+    assert {len(ids) for ids in ours.log.senders()} >= {0, 1}
+    ends = ours.log.position[:, -1]
     for processes in counts:
         real = fly(run, tmp_path / f"flight-{processes}", FlightOptions(processes=processes, pictures=False))
         assert np.array_equal(real.positions[1:80], ends[:79])

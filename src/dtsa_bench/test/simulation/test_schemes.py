@@ -115,9 +115,9 @@ def delivered(share: float, loss: float, agents: int = 12) -> float:
         "policy": "mixer", "agents": agents, "avoider": "none", "loss": loss, "seed": 3, "timeout_s": 8, "tail_s": 9,
         "stop_on_crash": False, "options": {"mixer.slots_per_agent": share},
     })  # fmt: skip
-    trace = simulate(run, trace=True).trace
+    log = simulate(run, log=True, observer=1).log
     period = round(share * agents)
-    ends = np.array(trace.heard_slot)[2 * period - 2 :: period, 1:]
+    ends = log.heard_slot[2 * period - 2 :: period, 1:]
     return float((ends == period * np.arange(1, len(ends) + 1)[:, None]).mean())
 
 
@@ -163,9 +163,9 @@ def test_first_reports_of_sotdma_that_enter_by_random_access_collide_as_often_as
     collided, first = 0, 0
     for seed in range(15):
         settings = {"policy": "sotdma", "agents": 20, "seed": seed, "timeout_s": 2, "options": {"sotdma.entry": 1}}
-        trace = simulate(run_config(settings), trace=True).trace
+        log = simulate(run_config(settings), log=True).log
         seen: set[int] = set()
-        for senders in trace.senders:
+        for senders in log.senders():
             new = set(senders) - seen
             collided += len(new) if len(senders) > 1 else 0
             first += len(new)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from dtsa_agent.air.serial.lengths import FRAMING
 from dtsa_agent.air.serial.modems import MODEMS, NONE, Modem
@@ -21,23 +22,14 @@ LONGEST_FRAME = 255
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The way between a flight processor and its radio.
+    """The way between a flight processor and its radio."""
 
-    :param to_fixed_ns: ns that any frame takes to the radio.
-    :param to_byte_ns: ns that each of its bytes adds.
-    :param from_fixed_ns: ns that any frame takes from the radio.
-    :param from_byte_ns: ns that each of its bytes adds.
-    :param waits: whether the radio does nothing else while it hands a reception over: a frame of its own that comes
-        meanwhile is sent afterwards.
-    :param queue: receptions that a radio holds, with the one that it hands over; 0: any number. More are lost.
-    """
-
-    to_fixed_ns: int = 0
-    to_byte_ns: int = 0
-    from_fixed_ns: int = 0
-    from_byte_ns: int = 0
-    waits: bool = False
-    queue: int = 0
+    to_fixed_ns: int = 0  # that any frame takes to the radio
+    to_byte_ns: int = 0  # that each of its bytes adds
+    from_fixed_ns: int = 0  # that any frame takes from the radio
+    from_byte_ns: int = 0  # that each of its bytes adds
+    waits: bool = False  # the radio does nothing else while it hands a reception over: frames of its own wait
+    queue: int = 0  # receptions that a radio holds, with the one that it hands over; 0: any number. More are lost
 
     @property
     def serial(self) -> bool:
@@ -47,24 +39,14 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Airtime:
-    """Times of one transmission; lengths are the bytes of a frame.
+    """Times of one transmission; lengths are the bytes of a frame."""
 
-    :param bitrate: bit/s on air.
-    :param ramp_up_ns: ns from the order to send until the first bit is on air; the sender is deaf, the air
-        still free.
-    :param overhead_bits: bits on air beside those of the frame.
-    :param line: the way between flight processor and radio.
-    :param longest: bytes of the longest frame that the radio takes.
-    :param formula: ns on air by the bytes of a frame, for radios whose times are no multiple of a bit; None: by
-        ``overhead_bits`` and ``bitrate``.
-    """
-
-    bitrate: int = 2_000_000
-    ramp_up_ns: int = 130_000
-    overhead_bits: int = OVERHEAD_BITS + 8 * HEADER_BYTES
+    bitrate: int = 2_000_000  # bit/s on air
+    ramp_up_ns: int = 130_000  # from the order to send until the first bit is on air; the sender is deaf, the air free
+    overhead_bits: int = OVERHEAD_BITS + 8 * HEADER_BYTES  # bits on air beside those of the frame
     line: Line = Line()
-    longest: int = LONGEST_FRAME
-    formula: Callable[[int], int] | None = None
+    longest: int = LONGEST_FRAME  # bytes of the longest frame that the radio takes
+    formula: Callable[[int], int] | None = None  # ns on air by the bytes of a frame, where no multiple of a bit
 
     def on_air_ns(self, length: int) -> int:
         """Return the time that the bits of a frame are on air, ns, rounded up.
@@ -114,18 +96,12 @@ class Airtime:
 
 @dataclass(frozen=True, slots=True)
 class RadioRow:
-    """A radio: all that differs between them.
-
-    :param airtime: its times.
-    :param text: what it is, for a table.
-    :param source: where its times are from.
-    :param tuned: whether ``bitrate`` and ``ramp_up_ns`` are settings of it; else they are the row's.
-    """
+    """A radio: all that differs between them."""
 
     airtime: Airtime
-    text: str
-    source: str
-    tuned: bool = False
+    text: str  # what it is, for a table
+    source: str  # where its times are from
+    tuned: bool = False  # ``bitrate`` and ``ramp_up_ns`` are settings of it; else they are the row's
 
 
 # Source of both ways: ``src/syslink.c`` and ``src/main.c`` of crazyflie2-nrf-firmware. At 1 Mbaud a byte takes 10 us.
@@ -164,15 +140,14 @@ RADIOS: dict[str, RadioRow] = {
 
 
 def airtime_of(radio: str, bitrate: int, ramp_up_ns: int, link_delay_ns: int) -> Airtime:
-    """Return the times of a radio under settings.
-
-    :param radio: its name in the table.
-    :param bitrate: bit/s on air, where it is a setting of the radio.
-    :param ramp_up_ns: ns from the order to send to the first bit, likewise.
-    :param link_delay_ns: ns each way between flight processor and radio, with ``plain``.
-    """
+    """Return the times of a radio, by its name, under settings as :class:`ChannelConfig` has them."""
     row = RADIOS[radio]
     if not row.tuned:
         return row.airtime
     line = Line(link_delay_ns, 0, link_delay_ns, 0) if radio == "plain" else row.airtime.line
-    return replace(row.airtime, bitrate=bitrate, ramp_up_ns=ramp_up_ns, line=line)
+    return _tuned(row.airtime, bitrate, ramp_up_ns, line)
+
+
+@lru_cache(maxsize=64)  # each flight asks several times
+def _tuned(airtime: Airtime, bitrate: int, ramp_up_ns: int, line: Line) -> Airtime:
+    return replace(airtime, bitrate=bitrate, ramp_up_ns=ramp_up_ns, line=line)

@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from .config import ChannelConfig
 from .losses import NoiseSource
 from .medium import Medium, OnAir
-from .schedule import Change, Epoch, Timeline
+from .schedule import Change, Timeline
 from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 Positions = NDArray[np.float64]
@@ -109,11 +109,21 @@ class Channel:
             self._use(slot)
         return self._medium
 
+    def fill_losses(self, slot: int, losses: Any) -> int:
+        """Tell C which receivers lose a frame that is alone in its slot.
+
+        :param losses: a ``sim_losses`` (``libdtsa_sim/run.h``), which is filled in.
+        :returns: the slot up to which that holds; 0: :meth:`arbitrate` has to say what becomes of this slot's frames.
+        """
+        if not self._first <= slot < self._end:
+            self._use(slot)
+        return min(self._end, self._losses.fill(slot, losses)) if self._simple else 0
+
     def _use(self, slot: int) -> None:
         """Make the settings of a slot the present ones."""
         if slot < 0:
             raise LocalProtocolError(f"slot {slot}: slots count from 0")
-        epoch: Epoch[ChannelConfig] = self._timeline.at(slot)
+        epoch = self._timeline.at(slot)
         self._first, self._end = epoch.first, _FOREVER if epoch.end is None else epoch.end
         self._medium = Medium(epoch.config, self._source)
         self._losses = self._medium.losses
@@ -157,10 +167,7 @@ class Channel:
             self._medium.judge(slot, on_air[k], on_air[:k] + on_air[k + 1 :], positions)
             for k in range(first, len(on_air))
         ]
-        received = np.array([reception.received for reception in receptions])
-        lost = tuple(reception.lost for reception in receptions)
-        collided = tuple(reception.collided for reception in receptions)
-        return Verdict(COLLISION if any(collided) else SUCCESS, senders, received, lost, collided)
+        return Verdict.of(senders, receptions)
 
     def _sent(self, slot: int, senders: tuple[int, ...], lengths: Sequence[int] | None) -> list[OnAir]:
         """Return the transmissions of a slot: all start with it."""

@@ -1,4 +1,4 @@
-"""The channel's settings: described, validated once, read from YAML, changed by a schedule."""
+"""Settings of the channel and of the agents' clocks: described, validated once, read from YAML."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, build, check, setting, settings_of
 
 from .airtime import RADIOS, Airtime, airtime_of
+from .draws import CLOCK, generator
 from .gilbert import GilbertElliott
 from .measured import MeasuredLosses, losses_of
 from .schedule import Change, Timeline
@@ -20,12 +21,21 @@ from .topology import Groups, LinkLoss, Matrix, listed, parse_links, parse_matri
 _SLOT_MS = Setting("slot_ms", "float", None, "length of a slot", unit="ms", minimum=1e-6, maximum=1e6)
 
 
+@dataclass(frozen=True, slots=True)
+class AnswerLimits(Settings):
+    """Wall time that agents have to answer."""
+
+    startup_s: float = setting(
+        60.0, "wall time that all agents have to answer slot 0", unit="s", minimum=0.1, maximum=86400
+    )
+    answer_s: float = setting(
+        10.0, "wall time that all agents have to answer any later slot", unit="s", minimum=0.1, maximum=86400
+    )
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class ChannelConfig(Settings):
-    """Everything that the channel's behaviour depends on. Models and formulas: docs/reference/channel.md.
-
-    :raises ConfigError: when a setting, or a combination of settings, is not usable.
-    """
+    """Everything that the channel's behaviour depends on. Models and formulas: docs/reference/channel.md."""
 
     agents: int = setting(REQUIRED, "number of agents; their ids are 1 to this number", minimum=1, maximum=65535)
     slot_ns: int = setting(10_000_000, "length of a slot", unit="ns", minimum=1, maximum=10**12)
@@ -154,9 +164,8 @@ class ChannelConfig(Settings):
 
     @classmethod
     def from_yaml(cls, path: str | Path, **overrides: Any) -> ChannelConfig:
-        """Return the settings of a YAML file.
+        """Return the settings of a YAML file: a mapping of settings, or one with such a mapping under ``channel``.
 
-        :param path: the file: a mapping of settings, or a mapping with such a mapping under ``channel``.
         :param overrides: settings that win over the file's; those that are None are ignored.
         :raises ConfigError: when the file cannot be read or a setting is not usable.
         """
@@ -170,11 +179,12 @@ class ChannelConfig(Settings):
         return cls.from_dict({**settings, **given})
 
     def changed(self, values: Mapping[str, Any]) -> ChannelConfig:
-        """Return these settings with some changed, without the schedule.
+        """Return these settings with some changeable ones changed, without the schedule.
 
-        :param values: names and values of changeable settings.
         :raises ConfigError: when a setting cannot change in flight or its value is not allowed.
         """
+        if not (values or self.schedule):
+            return self
         for name in values:
             if name not in CHANGEABLE:
                 raise ConfigError(str(name), values[name], f"a setting that may change: {', '.join(CHANGEABLE)}")
@@ -183,3 +193,29 @@ class ChannelConfig(Settings):
 
 #: Settings that may change while the channel runs, by the schedule or by :meth:`Channel.set`.
 CHANGEABLE: tuple[str, ...] = tuple(spec.name for spec in settings_of(ChannelConfig) if spec.changeable)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class ClockConfig(Settings):
+    """How far the agents' clocks are from the channel's."""
+
+    offset_ns: int = setting(0, "largest offset of a clock at the start", unit="ns", minimum=0, maximum=10**15)
+    drift_ppm: float = setting(0.0, "largest drift of a clock, either way", unit="ppm", minimum=0.0, maximum=1000.0)
+    jitter_ns: float = setting(0.0, "standard deviation of an event's time", unit="ns", minimum=0.0, maximum=1e9)
+    seed: int = setting(0, "seed of all clocks", minimum=0, maximum=2**63 - 1)
+
+
+class AgentClock(NamedTuple):
+    """One agent's clock: local = channel + offset + channel * drift."""
+
+    offset_ns: int  # what the clock shows at the channel's time 0
+    drift_ppb: int  # parts per billion by which it runs fast
+
+
+def make_clocks(config: ClockConfig, agents: int) -> tuple[AgentClock, ...]:
+    """Return the clocks of the agents 1 to N: offset and drift uniform within limits, by seed and agent."""
+    clocks = []
+    for agent in range(1, agents + 1):
+        offset, drift = generator(config.seed, CLOCK, agent).uniform(-1.0, 1.0, size=2)
+        clocks.append(AgentClock(round(offset * config.offset_ns), round(drift * config.drift_ppm * 1000.0)))
+    return tuple(clocks)

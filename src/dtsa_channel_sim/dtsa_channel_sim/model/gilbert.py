@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +120,24 @@ class Chains:
         bad.setflags(write=False)
         self._known[sender] = (slot, bad)
         return bad
+
+    def arrays(self, senders: Sequence[int], slot: int) -> dict[str, NDArray[Any]]:
+        """Return where words decide, and the phases (1: bad) in a slot, -1: before the first; rows by sender, (C, N).
+
+        :param senders: ids; (0,) where all receivers have one chain each.
+        """
+        agents = self._words.agents
+        limits = [self._limits[sender] for sender in senders]
+        shape = len(senders), agents
+        arrays = {
+            name: np.array([np.broadcast_to(getattr(row, name), agents) for row in limits])
+            for name in ("enter", "keep", "share")
+        }
+        phase = np.zeros(shape, dtype=np.uint8)
+        for row, sender in enumerate(senders if slot >= 0 else ()):
+            factor = self._factors[sender] if sender else np.uint64(1)
+            phase[row] = self._look_back(slot, factor, limits[row], -1, None)
+        return {**arrays, "phase": phase}
 
     def _look_back(self, slot: int, factor: np.uint64, limits: _Limits, floor: int, before: Mask | None) -> Mask:
         """Return the states (N,) in a slot, from the last word that decided, or ``before`` in ``floor``."""

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dtsa_agent.core.kernel import memory
 
 from .config import ChannelConfig
 from .draws import LOSS, STATE, WordBlocks, sender_factors, threshold
@@ -20,13 +24,19 @@ Thresholds = Sequence[NDArray[np.uint64]]
 class NoiseSource:
     """The random numbers of a channel: the same for all settings that it goes through."""
 
-    __slots__ = ("factors", "state_factors", "state_words", "words")
-
     def __init__(self, seed: int, agents: int) -> None:
-        self.words = WordBlocks(seed, LOSS, agents)
-        self.factors = sender_factors(seed, LOSS, agents)
-        self.state_words = WordBlocks(seed, STATE, agents)
-        self.state_factors = sender_factors(seed, STATE, agents)
+        self.words, self.state_words = WordBlocks(seed, LOSS, agents), WordBlocks(seed, STATE, agents)
+        self._seed, self._agents = seed, agents
+
+    @cached_property
+    def factors(self) -> list[np.uint64]:
+        """Constants of senders, by id."""
+        return sender_factors(self._seed, LOSS, self._agents)
+
+    @cached_property
+    def state_factors(self) -> list[np.uint64]:
+        """The same for the words of bursts."""
+        return sender_factors(self._seed, STATE, self._agents)
 
 
 class Losses:
@@ -36,7 +46,7 @@ class Losses:
     P(received) = (1 - loss) (1 - link loss) (1 - measured loss).
     """
 
-    __slots__ = ("_bad", "_certain", "_chains", "_good", "_per_link", "_source", "none")
+    __slots__ = ("_bad", "_certain", "_chains", "_good", "_lent", "_per_link", "_source", "none")
 
     def __init__(self, config: ChannelConfig, source: NoiseSource) -> None:
         self._source = source
@@ -71,6 +81,34 @@ class Losses:
             return bad
         words = self._source.words.row(slot) * self._source.factors[sender]
         return words < np.where(bad, self._bad[sender], self._good[sender])
+
+    def fill(self, slot: int, losses: Any) -> int:
+        """Fill a ``sim_losses`` from a slot on; return the slot up to which it holds."""
+        losses.none, losses.chains = self.none, 0
+        if self.none:
+            return 2**63 - 1
+        source, agents = self._source, self._source.words.agents
+        number = slot // source.words.rows
+        losses.first = number * source.words.rows
+        arrays = {
+            "words": source.words.block(number), "factors": np.array(source.factors[1:]),
+            "good": _rows(self._good, agents), "bad": _rows(self._bad, agents),
+        }  # fmt: skip
+        if self._chains is not None:
+            senders = range(1, agents + 1) if self._per_link else (0,)
+            arrays |= self._chains.arrays(senders, slot - 1)
+            arrays |= {"state_words": source.state_words.block(number)}
+            arrays |= {"state_factors": np.array(source.state_factors[1:])}
+            losses.chains, losses.certain = len(senders), self._certain
+        self._lent = {name: memory(array) for name, array in arrays.items()}
+        for name, lent in self._lent.items():
+            setattr(losses, name, lent)
+        return int(losses.first) + source.words.rows
+
+
+def _rows(thresholds: Thresholds, agents: int) -> NDArray[np.uint64]:
+    """Return thresholds by sender and receiver, (N, N)."""
+    return np.array([np.broadcast_to(row, agents) for row in thresholds[1:]])
 
 
 def _thresholds(loss: float, links: NDArray[np.float64] | None, agents: int) -> Thresholds:

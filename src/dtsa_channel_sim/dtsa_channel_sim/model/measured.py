@@ -34,24 +34,15 @@ class Fitted(NamedTuple):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class MeasuredLosses:
-    """Content of a file of losses. A bag holds all of it, so no reader needs the file again.
+    """Content of a file of losses. A bag holds all of it, so no reader needs the file again."""
 
-    :param name: name of the file.
-    :param sha256: hash of its bytes, hexadecimal.
-    :param slot_ns: ns, length of the slots in which the chains move; 0: not known.
-    :param enter: (N, N) P(good -> bad) per slot of each link, row = sender.
-    :param leave: (N, N) P(bad -> good).
-    :param loss_good: (N, N) loss in the good state.
-    :param loss_bad: (N, N) loss in the bad state.
-    """
-
-    name: str
-    sha256: str
-    slot_ns: int
-    enter: Matrix
-    leave: Matrix
-    loss_good: Matrix
-    loss_bad: Matrix
+    name: str  # of the file
+    sha256: str  # of its bytes, hexadecimal
+    slot_ns: int  # ns, length of the slots in which the chains move; 0: not known
+    enter: Matrix  # (N, N) P(good -> bad) per slot of each link, row = sender
+    leave: Matrix  # (N, N) P(bad -> good)
+    loss_good: Matrix  # (N, N) loss in the good state
+    loss_bad: Matrix  # (N, N) loss in the bad state
 
     def __repr__(self) -> str:
         """The name of the file, and the beginning of its hash."""

@@ -5,65 +5,38 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, TypeAlias
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 
 from .topology import parse_links, parse_partition
 
-_NS_PER_S = 1_000_000_000
 _SLOT = Setting("slot", "int", None, "a slot", minimum=0, maximum=2**53)
 _SECONDS = Setting("at_s", "float", None, "seconds after the start of slot 0", unit="s", minimum=0, maximum=1e9)
 _TIMES = ("slot", "at_s", "until", "until_s")
 
-_Config = TypeVar("_Config", bound="Changing")
-
-
-class Changing(Protocol):
-    """Settings of a channel, which a schedule may change: :class:`.config.ChannelConfig`."""
-
-    @property
-    def agents(self) -> int:
-        """Number of agents."""
-
-    @property
-    def slot_ns(self) -> int:
-        """Length of a slot, ns."""
-
-    @property
-    def schedule(self) -> tuple[Change, ...]:
-        """Changes at known slots."""
-
-    def changed(self: _Config, values: Mapping[str, Any]) -> _Config:
-        """These settings with some changed, without the schedule."""
+Config: TypeAlias = Any  # a :class:`.config.ChannelConfig`, which a schedule may change
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Settings that change at a slot: an entry of the schedule, or a change made while the channel ran.
+    """Settings that change at a slot: an entry of the schedule, or a change made while the channel ran."""
 
-    :param slot: first slot with the new values.
-    :param values: pairs of the setting's name and its new value.
-    :param until: first slot without them again; None: they stay.
-    """
-
-    slot: int
-    values: tuple[tuple[str, Any], ...]
-    until: int | None = None
+    slot: int  # first slot with the new values
+    values: tuple[tuple[str, Any], ...]  # pairs of the setting's name and its new value
+    until: int | None = None  # first slot without them again; None: they stay
 
     def __post_init__(self) -> None:
         # In one order, so that equal changes are equal objects.
         object.__setattr__(self, "values", tuple(sorted(self.values, key=lambda pair: pair[0])))
 
     @classmethod
-    def from_dict(cls, entry: object, config: Changing, name: str) -> Change:
-        """Return an entry ``{slot | at_s: ..., until | until_s: ..., loss: ..., jam: ...}``, validated.
+    def from_dict(cls, entry: object, config: Config, name: str) -> Change:
+        """Return an entry ``{slot | at_s: ..., until | until_s: ..., loss: ..., jam: ...}`` of this name, validated.
 
         Seconds count from the start of slot 0; the change comes with the first slot that starts then or later.
 
-        :param config: the settings it changes.
-        :param name: name of the entry, for the errors.
         :raises ConfigError: naming the part that is wrong.
         """
         if isinstance(entry, Change):
@@ -93,7 +66,7 @@ def _plain(value: Any) -> Any:
     return value.to_dict() if hasattr(value, "to_dict") else value
 
 
-def _normal(config: Changing, name: str, value: object, entry: str) -> tuple[str, Any]:
+def _normal(config: Config, name: str, value: object, entry: str) -> tuple[str, Any]:
     """Return one changed setting as the configuration stores it; the combination is checked later."""
     spec = next((spec for spec in settings_of(type(config)) if spec.name == name and spec.changeable), None)
     if spec is None:
@@ -112,24 +85,24 @@ def _when(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: int, 
         return int(_SLOT.check(entry[slot_key], f"{name}.{slot_key}"))
     if entry.get(time_key) is not None:
         seconds: float = _SECONDS.check(entry[time_key], f"{name}.{time_key}")
-        return -(-round(seconds * _NS_PER_S) // slot_ns)
+        return -(-round(seconds * 1e9) // slot_ns)
     return None
 
 
-def _changeable(config: Changing) -> str:
+def _changeable(config: Config) -> str:
     return ", ".join(spec.name for spec in settings_of(type(config)) if spec.changeable)
 
 
 @dataclass(frozen=True, slots=True)
-class Epoch(Generic[_Config]):
+class Epoch:
     """Slots with the same settings: from ``first`` up to, not including, ``end``; None: it lasts."""
 
     first: int
     end: int | None
-    config: _Config
+    config: Config
 
 
-class Timeline(Generic[_Config]):
+class Timeline:
     """Settings by slot, a pure function of the configuration and of the changes.
 
     Entries of the schedule may overlap: the one that began last counts (of two that begin together, the later
@@ -142,11 +115,11 @@ class Timeline(Generic[_Config]):
 
     __slots__ = ("_base", "_changes", "_configs", "_slots")
 
-    def __init__(self, config: _Config) -> None:
+    def __init__(self, config: Config) -> None:
         self._base = config.changed({})
         self._changes: list[Change] = []  # by slot, ascending
         self._slots: list[int] = [0]  # slots at which settings change, ascending
-        self._configs: list[_Config] = [self._base]
+        self._configs: list[Config] = [self._base]
         for change in scheduled_changes(config):
             self.add(change)
 
@@ -171,14 +144,14 @@ class Timeline(Generic[_Config]):
                 configs.append(config)
         self._changes, self._slots, self._configs = changes, slots, configs
 
-    def at(self, slot: int) -> Epoch[_Config]:
+    def at(self, slot: int) -> Epoch:
         """Return the slots with the same settings to which a slot belongs."""
         i = bisect_right(self._slots, slot) - 1
         end = self._slots[i + 1] if i + 1 < len(self._slots) else None
         return Epoch(self._slots[i], end, self._configs[i])
 
 
-def scheduled_changes(config: Changing) -> Iterable[Change]:
+def scheduled_changes(config: Config) -> Iterable[Change]:
     """Turn entries of the schedule, which may end, into changes that stay, at most one per slot."""
     names = {name for entry in config.schedule for name, _ in entry.values}
     edges = sorted({e.slot for e in config.schedule} | {e.until for e in config.schedule if e.until is not None})

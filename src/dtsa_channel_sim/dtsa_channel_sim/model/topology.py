@@ -1,4 +1,4 @@
-"""Who is connected with whom: groups of a partition, losses of links, distances."""
+"""Which agents are connected: groups of a partition, losses of links, distances; and how settings say so."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ Matrix = tuple[tuple[float, ...], ...]  # (N, N), row = sender, column = receive
 Groups = tuple[tuple[int, ...], ...]  # ids
 
 _PROBABILITY = Setting("loss", "float", None, "loss of a link", minimum=0.0, maximum=1.0)
+_BOTH_WAYS = Setting("both_ways", "bool", None, "true or false")
 _LINK_KEYS = ("from", "to", "loss", "both_ways")
+
+# Functions that parse take the setting's name, and raise ConfigError naming the part that is wrong.
 
 
 def listed(value: object, name: str) -> Sequence[Any]:
-    """Return a list, also of a JSON text; None and empty text: an empty one.
-
-    :param name: name of the setting, for the error.
-    :raises ConfigError: when it is none.
-    """
+    """Return a list, also of a JSON text; None and empty text: an empty one."""
     if value is None or value == "":
         return ()
     entries = value
@@ -40,12 +39,7 @@ def listed(value: object, name: str) -> Sequence[Any]:
 
 
 def parse_ids(value: object, agents: int, name: str) -> tuple[int, ...]:
-    """Return the ids of an id or a list of ids, ascending and without doubles.
-
-    :param agents: number of agents N; ids run from 1 to N.
-    :param name: name of the setting, for the error.
-    :raises ConfigError: when there is none, or one is out of range.
-    """
+    """Return the ids of an id or a list of ids of N agents, ascending and without doubles; one at least."""
     several = isinstance(value, Sequence) and not isinstance(value, str)
     ids: Sequence[Any] = value if several else (value,)  # type: ignore[assignment]
     if not ids:
@@ -57,13 +51,10 @@ def parse_ids(value: object, agents: int, name: str) -> tuple[int, ...]:
 
 
 def parse_partition(value: object, agents: int, name: str = "partition") -> Groups:
-    """Return the groups of a partition, in the order given; empty when all are together.
+    """Return the groups of a partition of N agents, in the order given; empty when all are together.
 
-    :param value: a list of groups of ids, ``[[1, 2], [3, 4]]``, or JSON text of one; empty: one group. Agents that are
-        not named form one more group.
-    :param agents: number of agents N.
-    :param name: name of the setting, for the error.
-    :raises ConfigError: naming the group that is wrong.
+    ``value`` is a list of groups of ids, ``[[1, 2], [3, 4]]``, or JSON text of one; empty: one group. Agents that are
+    not named form one more group.
     """
     groups = [parse_ids(group, agents, f"{name}[{k}]") for k, group in enumerate(listed(value, name))]
     named: set[int] = set()
@@ -77,7 +68,7 @@ def parse_partition(value: object, agents: int, name: str = "partition") -> Grou
     return tuple(groups) if len(groups) > 1 else ()
 
 
-def group_numbers(groups: Sequence[Sequence[int]], agents: int) -> NDArray[np.int32]:
+def group_numbers(groups: Groups, agents: int) -> NDArray[np.int32]:
     """Return the number of each agent's group, (N,), zeros without a partition."""
     numbers = np.zeros(agents, dtype=np.int32)
     for number, group in enumerate(groups):
@@ -87,25 +78,16 @@ def group_numbers(groups: Sequence[Sequence[int]], agents: int) -> NDArray[np.in
 
 @dataclass(frozen=True, slots=True)
 class LinkLoss:
-    """Loss of some directed links.
+    """Loss of some directed links."""
 
-    :param sender: ids of the senders; empty: all.
-    :param receiver: ids of the receivers; empty: all.
-    :param loss: probability that a frame on such a link is lost, 0 to 1.
-    :param both_ways: True when the way back loses as much.
-    """
-
-    sender: tuple[int, ...]
-    receiver: tuple[int, ...]
-    loss: float
-    both_ways: bool = False
+    sender: tuple[int, ...]  # ids; empty: all
+    receiver: tuple[int, ...]  # ids; empty: all
+    loss: float  # probability that a frame on such a link is lost, 0 to 1
+    both_ways: bool = False  # the way back loses as much
 
     @classmethod
     def from_dict(cls, entry: object, agents: int, name: str) -> LinkLoss:
-        """Return the entry ``{from: ids, to: ids, loss: p, both_ways: false}``, validated; without ids: all agents.
-
-        :raises ConfigError: naming the part that is wrong.
-        """
+        """Return the entry ``{from: ids, to: ids, loss: p, both_ways: false}``; without ids: all agents."""
         if isinstance(entry, LinkLoss):
             entry = entry.to_dict()
         if not isinstance(entry, Mapping):
@@ -115,13 +97,9 @@ class LinkLoss:
                 raise ConfigError(f"{name}.{key}", entry[key], f"the keys {', '.join(_LINK_KEYS)}")
         if "loss" not in entry:
             raise ConfigError(f"{name}.loss", None, "a value: the entry needs loss")
-        both_ways = entry.get("both_ways", False)
-        if not isinstance(both_ways, bool):
-            raise ConfigError(f"{name}.both_ways", both_ways, "true or false")
-        sender, receiver = (
-            parse_ids(entry[key], agents, f"{name}.{key}") if key in entry else () for key in ("from", "to")
-        )
-        return cls(sender, receiver, _PROBABILITY.check(entry["loss"], f"{name}.loss"), both_ways)
+        both_ways = _BOTH_WAYS.check(entry.get("both_ways", False), f"{name}.both_ways")
+        ids = [parse_ids(entry[key], agents, f"{name}.{key}") if key in entry else () for key in ("from", "to")]
+        return cls(*ids, _PROBABILITY.check(entry["loss"], f"{name}.loss"), both_ways)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry as :meth:`from_dict` reads it."""
@@ -130,19 +108,12 @@ class LinkLoss:
 
 
 def parse_links(value: object, agents: int, name: str = "link_loss") -> tuple[LinkLoss, ...]:
-    """Return a list of losses of links, validated.
-
-    :raises ConfigError: naming the part that is wrong.
-    """
+    """Return a list of losses of links between N agents."""
     return tuple(LinkLoss.from_dict(entry, agents, f"{name}[{k}]") for k, entry in enumerate(listed(value, name)))
 
 
 def parse_matrix(value: object, agents: int, name: str = "loss_matrix") -> Matrix:
-    """Return an (N, N) matrix of probabilities; empty stays empty. The diagonal is not used and set to 0.
-
-    :param value: rows of numbers, row = sender, column = receiver.
-    :raises ConfigError: when its shape or a number is wrong.
-    """
+    """Return an (N, N) matrix of probabilities; empty stays empty. The diagonal is not used and set to 0."""
     if value is None:
         return ()
     try:
@@ -162,11 +133,7 @@ def parse_matrix(value: object, agents: int, name: str = "loss_matrix") -> Matri
 
 
 def link_matrix(matrix: Matrix, links: Sequence[LinkLoss], agents: int) -> NDArray[np.float64] | None:
-    """Return the loss of every link, (N, N), row = sender, column = receiver; None when no link is special.
-
-    :param matrix: loss of each link; empty for zeros.
-    :param links: entries laid over it, later ones over earlier ones.
-    """
+    """Return the loss of every link, (N, N): a matrix, empty for zeros, and entries over it; None: no link has any."""
     if not matrix and not links:
         return None
     result = np.array(matrix, dtype=np.float64) if matrix else np.zeros((agents, agents))

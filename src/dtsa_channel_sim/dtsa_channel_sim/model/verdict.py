@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,16 @@ class Verdict(NamedTuple):
     received: NDArray[np.bool_] | None  # (F, N) frame f reached agent column + 1; None: all but the sender have all
     lost: tuple[int, ...] | None  # per frame: receivers in reach that lost it to noise or jamming; None: none
     collided: tuple[int, ...] | None  # per frame: receivers where it collided or that were sending; None: none
+
+    @classmethod
+    def of(cls, senders: Sequence[int], receptions: Sequence[Any]) -> Verdict:
+        """Return the verdict on frames, by what became of each of them (``received``, ``lost``, ``collided``)."""
+        if not senders:
+            return cls(IDLE, (), None, None, None)
+        lost = tuple(reception.lost for reception in receptions)
+        collided = tuple(reception.collided for reception in receptions)
+        received = np.array([reception.received for reception in receptions])
+        return cls(COLLISION if any(collided) else SUCCESS, tuple(senders), received, lost, collided)
 
     def mask(self, agents: int) -> NDArray[np.bool_]:
         """Return ``received`` written out, (F, N), also where it is None."""

@@ -1,38 +1,45 @@
-"""What the agents did in one slot, as arrays: from the messages of all processes."""
+"""What the agents did in one slot, as arrays: of all processes' answers in lockstep, of their reports in real time."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
-from typing import Any
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import numpy as np
-from dtsa_msgs.msg import Transmission
 from numpy.typing import NDArray
 
 from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.wire.checks import FARTHEST_M, RANGE, SIZES, UNKNOWN, Unusable, check_frames
+from dtsa_agent.ros.common.wire.checks import FARTHEST_M, RANGE, SIZES, SLOT, Unusable, check_frames, check_ids
+from dtsa_agent.ros.common.wire.messages import TRANSMISSION, Fields
 from dtsa_agent.ros.common.wire.packing import split_frames
-from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields
 
 Array = NDArray[np.float64]
-_ONES = b"\1" * 65536  # at most so many agents have ids
+Places = slice | NDArray[np.intp]
+
+_DECIDED = ("chosen", "reason", "digest", "score")
+_MOTION = ("track", "velocity", "command", "goal")
+_SEQUENCES = attrgetter("length", *_DECIDED, *_MOTION[:-1])  # the goal may be left out
+_LONGEST = 2000  # slots in one report
+_MOST_HEARD = 20_000  # received frames in one report
+_FARTHEST_OFF_NS = 60_000_000_000  # no agent's slot is farther from the channel's
 
 
 @dataclass(slots=True)
 class TakenIn:
-    """A frame that agents took in during a slot, in real time."""
+    """A frame that agents received during a slot, in real time."""
 
     slot: int  # as its sender counts
     sender: int  # id
     data: bytes
     arrival_ns: int  # ns, when the receivers' flight processors could have had it, from the start of slot 0
-    at_ns: NDArray[np.int64]  # (N,) ns, when each agent took it in; -1: it did not
+    at_ns: NDArray[np.int64]  # (N,) ns, when each agent received it; -1: it did not
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """(N,) who took it in."""
+        """(N,) which agents received it."""
         return self.at_ns >= 0
 
 
@@ -41,32 +48,24 @@ class Answers:
 
     def __init__(self, agents: int, steps: int) -> None:
         self.agents, self.steps = agents, steps
-        # Vectors that lie in bytes: those of a message are put into their place as they are.
-        self._answered, self._told = bytearray(agents), bytearray(agents)
-        self._chosen, self._reason = bytearray(2 * agents), bytearray(agents)
-        self._digest, self._score = bytearray(4 * agents), bytearray(8 * agents)
-        self.answered = np.frombuffer(self._answered, dtype=np.bool_)
+        self.answered = np.zeros(agents, dtype=np.bool_)
         self.missing = agents
         self.frames: dict[int, bytes] = {}  # by id, of those that send
-        self.chosen = np.frombuffer(self._chosen, dtype=np.uint16)
-        self.reason = np.frombuffer(self._reason, dtype=np.uint8)
-        self.digest = np.frombuffer(self._digest, dtype=np.uint32)
-        self.score = np.frombuffer(self._score)
-        # All motion lies in one array, as in a message: who answers is written into it at once.
+        self.chosen = np.zeros(agents, dtype=np.uint16)
+        self.reason = np.zeros(agents, dtype=np.uint8)
+        self.digest = np.zeros(agents, dtype=np.uint32)
+        self.score = np.zeros(agents)
+        # All motion lies in one array, as in a message: an answer is written into it at once.
         self._motion = np.zeros((3 * steps + 9, agents))
         self.track = self._motion[:-9].reshape(steps, 3, agents)  # m, at the control instants of the slot before
         self.velocity = self._motion[-9:-6]  # m/s, now
         self.command = self._motion[-6:-3]  # m/s, now
         self.goal = self._motion[-3:]  # m
         self.offset_ns = np.zeros(agents, dtype=np.int64)  # real time: of slot or transmission
-        self.taken_in: list[TakenIn] | None = None  # real time: what the agents say to have taken in during the slot
-        self._goal_told = np.frombuffer(self._told, dtype=np.bool_)
-        self._layouts: dict[bytes, tuple[int, slice | NDArray[np.intp]]] = {}
-        # Numbers an agent in each field of a message, beside the frames' bytes.
-        self._sizes = {
-            "length": 1, "chosen": 1, "reason": 1, "digest": 1, "score": 1,
-            "track": 3 * steps, "velocity": 3, "command": 3, "goal": 3,
-        }  # fmt: skip
+        self.taken_in: list[TakenIn] | None = None  # real time: what the agents report to have received in the slot
+        self._goal_known = np.zeros(agents, dtype=np.bool_)
+        self._places: dict[bytes, Places] = {}
+        self._lengths: dict[int, tuple[int, ...]] = {}  # of the fields of answers that fit, by number of agents
 
     @property
     def position(self) -> Array:
@@ -79,123 +78,236 @@ class Answers:
         return (np.flatnonzero(~self.answered) + 1).tolist()
 
     def open(self) -> None:
-        """Begins a new slot."""
-        self._answered[:] = bytes(self.agents)
+        """Begin a new slot."""
+        self.answered[:] = False
         self.missing = self.agents
         self.frames = {}
 
-    def add(self, message: TransmissionFields | Transmission) -> bool:
+    def add(self, message: Fields) -> bool:
         """Add one transmission message; return False if its agents have answered already: nothing is changed then.
 
         :raises Unusable: if its fields do not fit together, naming the agents as far as it does.
         """
-        count, at = self._where(message.agent)
-        if isinstance(at, slice):
-            first, last = at.start, at.stop
-            if 1 in self._answered[first:last]:
-                return False
-        elif self.answered[at].any():
+        at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
+        if self.answered[at].any():
             return False
-        fields = message if isinstance(message, TransmissionFields) else self._fields(message, count)
+        lengths = (message.steps, *map(len, _SEQUENCES(message)))
+        if lengths != self._lengths.get(count) or len(message.goal) not in (0, 24 * count):
+            _check_sizes(message, {"length": count, **sizes_of(count, self.steps)}, self.steps, "an unusable answer")
+            self._lengths[count] = lengths
         frames: list[bytes] = []
-        if fields.data or any(fields.length):
-            check_frames(fields.length, fields.data)
-            frames = split_frames(fields.data, fields.length)
-        motion = np.frombuffer(b"".join((fields.track, fields.velocity, fields.command, fields.goal)))
-        self._check_numbers(message, motion, fields)
+        if message.data or any(message.length):
+            check_frames(message.length, message.data)
+            frames = split_frames(message.data, message.length)
+        motion = np.frombuffer(b"".join([getattr(message, name) for name in _MOTION]))
+        chosen, score = np.frombuffer(message.chosen, dtype=np.uint16), np.frombuffer(message.score)
+        if max(chosen.tolist()) > self.agents:
+            raise _unusable(RANGE, message, f"{chosen.max()} chosen of {self.agents} agents")
+        # A sum of squares is finite only if all its terms are, and small only if they are.
+        if not motion.dot(motion) <= FARTHEST_M**2:
+            raise _unusable(RANGE, message, "positions, velocities or goals that are no numbers, or far away")
+        if any(map(isnan, score.tolist())):
+            raise _unusable(RANGE, message, "scores that are no numbers")
         self._motion[: len(motion) // count, at] = motion.reshape(-1, count)
-        if isinstance(at, slice):
-            self._chosen[2 * first : 2 * last] = fields.chosen
-            self._reason[at] = fields.reason
-            self._digest[4 * first : 4 * last] = fields.digest
-            self._score[8 * first : 8 * last] = fields.score
-            self._answered[at] = _ONES[:count]
-            if fields.goal:
-                self._told[at] = _ONES[:count]
-        else:
-            self.chosen[at] = np.frombuffer(fields.chosen, dtype=np.uint16)
-            self.reason[at] = np.frombuffer(fields.reason, dtype=np.uint8)
-            self.digest[at] = np.frombuffer(fields.digest, dtype=np.uint32)
-            self.score[at] = np.frombuffer(fields.score)
-            self.answered[at] = True
-            if fields.goal:
-                self._goal_told[at] = True
+        self.chosen[at], self.score[at] = chosen, score
+        self.reason[at] = np.frombuffer(message.reason, dtype=np.uint8)
+        self.digest[at] = np.frombuffer(message.digest, dtype=np.uint32)
+        self.answered[at] = True
+        if message.goal:
+            self._goal_known[at] = True
         for agent, frame in zip(message.agent, frames, strict=False):
             if frame:
                 self.frames[agent] = frame
         self.missing -= count
         return True
 
-    def put(self, at: Any, count: int, offset_ns: Any, motion: Sequence[Array], **decided: Any) -> None:
-        """Add what agents have reported in real time, checked: start of their slots or transmissions, motion, decision.
+    def put(self, at: Places, count: int, offset_ns: Any, motion: Sequence[Array], **decided: Any) -> None:
+        """Add a report of real time, checked: start of slots or transmissions, motion, decision.
 
-        Their indices are ``at``; motion is track (m), velocity, command (m/s) and goal (m), as in a report.
+        Motion is track (m), velocity, command (m/s) and goal (m), as in a report.
         """
-        track, velocity, command, goal = motion
-        self.track[:, :, at] = track.reshape(self.steps, 3, count)
-        for mine, given in ((self.velocity, velocity), (self.command, command), (self.goal, goal)):
-            mine[:, at] = given.reshape(3, count)
+        self._motion[:, at] = np.concatenate(motion).reshape(-1, count)
         for name, values in decided.items():
             getattr(self, name)[at] = values
         self.offset_ns[at] = offset_ns
-        self._goal_told[at] = self.answered[at] = True
+        self._goal_known[at] = self.answered[at] = True
         self.missing -= count
 
-    def _fields(self, message: Transmission, count: int) -> TransmissionFields:
-        """The fields of a message, as long as its agents are many.
-
-        :raises Unusable: if they are not.
-        """
-        if message.steps != self.steps:
-            raise self._unusable(RANGE, message, f"{message.steps} control instants a slot instead of {self.steps}")
-        for name, size in self._sizes.items():
-            found, wanted = len(getattr(message, name)), size * count
-            if found != wanted and (name != "goal" or found):
-                raise self._unusable(SIZES, message, f"{found} numbers in {name} for {count} agents")
-        told = {name: getattr(message, name).tobytes() for name in (*self._sizes, "data")}
-        return TransmissionFields(0, message.run, message.slot, message.agent, **told)
-
-    def _check_numbers(
-        self, message: TransmissionFields | Transmission, motion: Array, fields: TransmissionFields
-    ) -> None:
-        """Whether the numbers of a message can be.
-
-        :raises Unusable: if they cannot.
-        """
-        largest = max(memoryview(fields.chosen).cast("H"))
-        if largest > self.agents:
-            raise self._unusable(RANGE, message, f"{largest} chosen of {self.agents} agents")
-        # A sum of squares is finite only if all its terms are, and small only if they are.
-        if not motion.dot(motion) <= FARTHEST_M**2:
-            raise self._unusable(RANGE, message, "positions, velocities or goals that are no numbers, or far away")
-        if any(map(isnan, memoryview(fields.score).cast("d"))):
-            raise self._unusable(RANGE, message, "scores that are no numbers")
-
-    @staticmethod
-    def _unusable(reason: str, message: Any, detail: str) -> Unusable:
-        return Unusable(reason, f"{named(message.agent)} sent an unusable answer: {detail}")
-
     def carry(self, before: Answers) -> None:
-        """Takes over from the slot before what nobody has told about this one: who is silent stays where it was."""
+        """Copy what this slot's messages leave out from the slot before: a silent agent stays where it was."""
         gone = ~self.answered
         if gone.any():
             self.track[:, :, gone] = before.position[:, gone]
             self.digest[gone], self.chosen[gone] = before.digest[gone], 0
-        # A goal is told when it changes.
-        untold = ~self._goal_told
-        self.goal[:, untold] = before.goal[:, untold]
+        # A goal is sent when it changes.
+        unknown = ~self._goal_known
+        self.goal[:, unknown] = before.goal[:, unknown]
 
-    def _where(self, ids: Any) -> tuple[int, slice | NDArray[np.intp]]:
-        """Number and indices of a message's agents, and a slice instead where they are consecutive."""
-        key = ids.tobytes()
-        known = self._layouts.get(key)
-        if known is None:
-            index = np.array(ids, dtype=np.intp) - 1
-            if not len(index) or index[0] < 0 or index[-1] >= self.agents or (np.diff(index) <= 0).any():
-                raise Unusable(
-                    UNKNOWN, f"a message for agents {list(ids[:8])}; allowed: ascending ids from 1 to {self.agents}"
-                )
-            run = index[-1] - index[0] + 1 == len(index)
-            known = len(index), slice(int(index[0]), int(index[-1]) + 1) if run else index
-            self._layouts[key] = known
-        return known
+
+def places_of(ids: Any, agents: int, known: dict[bytes, Places]) -> Places:
+    """Return the indices of a message's agents, a slice where they are consecutive; ``known`` keeps them.
+
+    :raises Unusable: for ids that do not ascend from 1 to N.
+    """
+    key = ids.tobytes()
+    places = known.get(key)
+    if places is None:
+        check_ids(ids, agents)
+        index = np.array(ids, dtype=np.intp) - 1
+        consecutive = index[-1] - index[0] + 1 == len(index)
+        places = known[key] = slice(int(index[0]), int(index[-1]) + 1) if consecutive else index
+    return places
+
+
+def sizes_of(count: int, steps: int) -> dict[str, int]:
+    """Return how many numbers a message has in each field that describes some agents in one slot."""
+    motion = {"track": 3 * steps * count, **dict.fromkeys(_MOTION[1:], 3 * count)}
+    return {**dict.fromkeys(_DECIDED, count), **motion}
+
+
+def _check_sizes(message: Fields, sizes: Mapping[str, int], steps: int, what: str) -> None:
+    """Check the number of control instants in a slot, and the lengths of sequences: bytes, or arrays."""
+    if message.steps != steps:
+        raise _unusable(RANGE, message, f"{message.steps} control instants a slot instead of {steps}", what)
+    for name, wanted in sizes.items():
+        values = getattr(message, name)
+        length = len(values)
+        if isinstance(values, bytes):
+            length //= _ITEM_BYTES[name]
+            if name == "goal" and not length:
+                continue
+        if length != wanted:
+            raise _unusable(SIZES, message, f"{length} numbers in {name} for {len(message.agent)} agents", what)
+
+
+_ITEM_BYTES = {
+    name: np.dtype(kind).itemsize for name, kind in zip(TRANSMISSION.fields, TRANSMISSION.kinds, strict=True)
+}
+
+
+def _unusable(reason: str, message: Fields, detail: str, what: str = "an unusable answer") -> Unusable:
+    return Unusable(reason, f"{named(message.agent)} sent {what}: {detail}")
+
+
+class Delivered(NamedTuple):
+    """A frame that was sent to its receivers."""
+
+    data: bytes
+    arrival_ns: int
+    received: NDArray[np.bool_]  # (N,)
+
+
+class Accounts:
+    """One account a slot in real time, filled by reports.
+
+    Frames are kept for ``keep`` slots, for agents that report late.
+    """
+
+    def __init__(self, agents: int, steps: int, keep: int) -> None:
+        self.agents, self._steps, self._keep = agents, steps, keep
+        self.missed = 0  # entries of reports that came too late to count
+        self._open: dict[int, Answers] = {}
+        self._closed = -1
+        self._delivered: dict[tuple[int, int], Delivered] = {}  # by slot and sender
+        self._taken_in: dict[int, dict[tuple[int, int], TakenIn]] = {}
+        self._places: dict[bytes, Places] = {}
+
+    def __getitem__(self, slot: int) -> Answers:
+        """The account of a slot that is not closed."""
+        book = self._open.get(slot)
+        if book is None:
+            book = self._open[slot] = Answers(self.agents, self._steps)
+        return book
+
+    def silent(self, slot: int) -> list[int] | None:
+        """Return the ids of the agents that have not reported for a slot; None: there is no report."""
+        book = self._open.get(slot)
+        return None if book is None else book.silent
+
+    def last_place(self, agent: int) -> Array | None:
+        """Return the last position that an agent has reported, (3,) m; None: in no slot yet."""
+        reported = [slot for slot, book in self._open.items() if book.answered[agent - 1]]
+        return self._open[max(reported)].position[:, agent - 1] if reported else None
+
+    def deliver(self, slot: int, sender: int, delivered: Delivered) -> None:
+        """A frame has been sent to its receivers."""
+        self._delivered[slot, sender] = delivered
+
+    def add(self, message: Fields, latest: int) -> int:
+        """Add a report; return its last slot that is still open, -1: none. No slot after ``latest`` can have begun.
+
+        :raises Unusable: if its fields do not fit together.
+        """
+        at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
+        _check_report(message, self._steps)
+        slots = message.slot.tolist()
+        last = max(slots[-1] if slots else 0, max(message.heard_in.tolist(), default=0))
+        if last > latest:
+            raise Unusable(SLOT, f"{named(message.agent)} reported slot {last}, which has not begun")
+        motion = [getattr(message, name).reshape(len(slots), -1) for name in _MOTION] if slots else []
+        newest = -1
+        for row, slot in enumerate(slots):
+            if slot <= self._closed:
+                self.missed += count
+                continue
+            book = self[slot]
+            if book.answered[at].any():
+                continue  # reported twice
+            part = slice(row * count, (row + 1) * count)
+            decided = {name: getattr(message, name)[part] for name in _DECIDED}
+            book.put(at, count, message.offset_ns[part], [planes[row] for planes in motion], **decided)
+            newest = slot
+        if len(message.heard_sender):
+            self._add_received(message, at, count)
+        return newest
+
+    def _add_received(self, message: Fields, at: Places, count: int) -> None:
+        """Add the frames that agents received, by the slot here; what was not delivered to them is left out."""
+        rows = message.heard_by.reshape(-1, -(-count // 8))
+        masks = np.unpackbits(rows, axis=1, count=count, bitorder="little").astype(np.bool_)
+        columns = (message.heard_slot, message.heard_sender, message.heard_in, message.heard_ns)
+        for slot, sender, here, at_ns, mask in zip(*(column.tolist() for column in columns), masks, strict=True):
+            delivered = self._delivered.get((slot, sender))
+            if delivered is None:
+                continue
+            entries = self._taken_in.setdefault(max(here, self._closed + 1), {})
+            taken = entries.get((slot, sender))
+            if taken is None:
+                never = np.full(self.agents, -1, dtype=np.int64)
+                taken = entries[slot, sender] = TakenIn(slot, sender, delivered.data, delivered.arrival_ns, never)
+            taken.at_ns[at] = np.where(mask & delivered.received[at], max(0, at_ns), taken.at_ns[at])
+
+    def close(self, slot: int) -> None:
+        """A slot is over: its account and what is too old is forgotten."""
+        self._closed = slot
+        self._open.pop(slot, None)
+        self._taken_in.pop(slot, None)
+        while self._delivered and (oldest := next(iter(self._delivered)))[0] < slot - self._keep:
+            del self._delivered[oldest]
+
+    def taken_in(self, slot: int) -> list[TakenIn]:
+        """Return the frames that agents received during a slot, as far as they have reported."""
+        return list(self._taken_in.get(slot, {}).values())
+
+
+def _check_report(message: Fields, steps: int) -> None:
+    """Check that the fields of a report fit together."""
+    count, slots, heard = len(message.agent), len(message.slot), len(message.heard_sender)
+    sizes = {"offset_ns": count * slots, "length": count * slots, **sizes_of(count * slots, steps)}
+    sizes |= dict.fromkeys(("heard_slot", "heard_in", "heard_ns"), heard) | {"heard_by": heard * -(-count // 8)}
+    _check_sizes(message, sizes, steps, "an unusable report")
+    if slots > _LONGEST or (message.slot[1:] <= message.slot[:-1]).any():
+        raise _unusable(SLOT, message, "slots that do not ascend, or too many", "a report of")
+    if heard > _MOST_HEARD:
+        raise _unusable(SIZES, message, f"{heard} frames at once", "a report of")
+    offsets = message.offset_ns
+    if slots and not -_FARTHEST_OFF_NS <= offsets.min() <= offsets.max() <= _FARTHEST_OFF_NS:
+        farthest = np.abs(offsets.astype(np.float64)).max() / 1e9
+        raise _unusable(RANGE, message, f"slots {farthest:.3g} s from the channel's", "a report of")
+    # A sum of squares is finite only if all its terms are, and small only if they are.
+    for name in ("score", *_MOTION):
+        values = getattr(message, name)
+        with np.errstate(over="ignore"):
+            size = values @ values
+        if not size <= FARTHEST_M**2:
+            raise _unusable(RANGE, message, f"{name} that are no numbers, or beyond {FARTHEST_M:g}", "a report of")

@@ -19,17 +19,14 @@ from rclpy.parameter import Parameter
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import setting, settings_of
 from dtsa_agent.ros.common.graph.names import MODES
-from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, from_parameter
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, from_parameter, swarm_wide_node
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import run_node
+from dtsa_agent.ros.common.process.node_process import ending, run_node
 from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
-from dtsa_agent.ros.common.workarounds.kept_nodes import ending
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.config import CHANGEABLE, ChannelConfig
+from dtsa_channel_sim.model.config import CHANGEABLE, AnswerLimits, ChannelConfig
 from dtsa_channel_sim.model.schedule import Change
 
-from .answer_limits import AnswerLimits
 from .lockstep import LockstepChannel
 from .observer import SlotLimit
 from .realtime_channel import RealtimeChannel
@@ -69,10 +66,7 @@ def follow_parameters(node: Node, channel: Channel, changed: Callable[[Change], 
 
 @dataclass(frozen=True, slots=True)
 class ChannelNodeSettings(AnswerLimits):
-    """What the channel's node needs beside the channel's settings.
-
-    :raises ConfigError: for values that are not allowed.
-    """
+    """What the channel's node needs beside the channel's settings."""
 
     slots: int = setting(0, "the run ends after so many slots; 0: by a signal only", minimum=0, maximum=2**31)
     mode: str = setting(

@@ -6,25 +6,21 @@ import time
 from typing import Any
 
 import numpy as np
-from dtsa_msgs.msg import Slot, Transmission
+from dtsa_msgs.msg import Transmission
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.process.runs import run_text
 from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire.checks import OTHER_RUN, OTHER_SENDER, SLOT, UNREADABLE, Unusable
-from dtsa_agent.ros.common.wire.stamps import header_of
-from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, read_transmission
+from dtsa_agent.ros.common.wire.checks import OTHER_RUN, OTHER_SENDER, SLOT, Unusable
+from dtsa_agent.ros.common.wire.messages import TRANSMISSION
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .ros_channel import RosChannel, put_frames
+from .ros_channel import REPEAT_S, RosChannel
 
-_REPEAT_S = 0.1  # until all agents have answered slot 0, it is sent again and again
-_REPEAT_LATER_S = 0.5  # and any later slot
+_REPEAT_LATER_S = 0.5  # a slot is sent again so often until all agents have answered it; slot 0 more often
 _GARBAGE_PATIENCE_S = 0.5
 
 
@@ -35,67 +31,61 @@ class LockstepChannel(RosChannel):
     """
 
     def __init__(self, node: Node, channel: Channel, steps: int, answer_s: float = 10.0, **more: Any) -> None:
-        super().__init__(node, channel, steps, waiting=1, **more)
+        super().__init__(node, channel, steps, waiting=1, input=(Transmission, names.TRANSMISSION), **more)
         self._answer_s = answer_s
         self._complaint, self._complaint_time = "", 0.0
         self._bytes = b""
 
     def _run(self, stop: object) -> None:
-        """Runs slot after slot until the run is over or ``stop`` is true. The agents are told to end.
+        """Run slot after slot.
 
         :raises LocalProtocolError: when an agent does not answer in time.
         :raises RemoteProtocolError: when an agent sends unusable messages only.
         :raises ConfigError: before slot 0, when nodes do not fit together.
-        :raises DtsaError: when an observer fails.
         """
-        try:
-            if not self._call(stop):
+        if not self._call(stop):
+            return
+        verdict: Verdict | None = None
+        frames: dict[int, bytes] = {}
+        slot = 0
+        while not stop:
+            self._open(slot, frames, verdict)
+            if slot and verdict is not None:
+                self._observers.slot_over(slot - 1, self.answers, verdict)
+            self.answers.open()
+            if not self._collect(slot, stop) or not self._goes_on(slot, self.answers):
                 return
-            verdict: Verdict | None = None
-            frames: dict[int, bytes] = {}
-            slot = 0
-            while not stop:
-                self._open(slot, frames, verdict)
-                if slot and verdict is not None:
-                    self._observers.slot_over(slot - 1, self.answers, verdict)
-                self.answers.open()
-                if not self._collect(slot, stop) or not self._goes_on(slot, self.answers):
-                    return
-                frames = self.answers.frames
-                verdict = self._judge(slot, frames)
-                self._observers.judged(slot, self.answers, frames, verdict)
-                slot += 1
-        finally:
-            self._publish_end()
-
-    def _judge(self, slot: int, frames: dict[int, bytes]) -> Verdict:
-        senders = sorted(frames)
-        lengths = [len(frames[sender]) for sender in senders]
-        return self.model.arbitrate(slot, senders, lengths, self.answers.position)
+            frames = self.answers.frames
+            senders = sorted(frames)
+            lengths = [len(frames[sender]) for sender in senders]
+            verdict = self.model.arbitrate(slot, senders, lengths, self.answers.position)
+            self._observers.judged(slot, self.answers, frames, verdict)
+            slot += 1
 
     def _open(self, slot: int, frames: dict[int, bytes], verdict: Verdict | None) -> None:
-        """Publishes the message that opens a slot."""
+        """Publish the message that opens a slot."""
         time_ns = names.slot_time_ns(slot, self.slot_ns)
-        header = header_of(time_ns)
-        message = Slot(header=header, run=self.run_id, slot=slot, phase=Slot.RUN, heard_slot=max(slot - 1, 0))
+        heard_slot = max(slot - 1, 0)
         if verdict is not None and verdict.senders:
             mask = verdict.mask(self.agents)
             heard = np.flatnonzero(mask.any(axis=1))
             senders = [verdict.senders[row] for row in heard]
-            put_frames(message, senders, [frames[sender] for sender in senders], mask[heard])
+            received = [frames[sender] for sender in senders]
+            self._bytes = self._pack_slot(time_ns, slot, heard_slot, senders, received, mask[heard])
+        else:
+            self._bytes = self._pack_slot(time_ns, slot, heard_slot)
         self.slot, self._complaint = slot, ""
-        self._bytes = serialize_message(message)
         self._publisher.publish(self._bytes)
-        self._tell_time(header.stamp)
+        self._publish_clock(time_ns)
         self._observers.slot_published(slot, self._bytes, time_ns)
 
     def _collect(self, slot: int, stop: object) -> bool:
-        """Takes in answers until all agents have given theirs; False when stopped."""
+        """Collect answers until all agents have given theirs; return False when stopped."""
         loop, answers = self.loop, self.answers
         patience, repeat = Patience(), time.monotonic()
         while answers.missing:
             data = loop.wait()
-            if data is None or not self._take(slot, data):
+            if data is None or not self._accept(slot, data):
                 if stop:
                     return False
                 repeat = self._wait(slot, patience.look(), repeat)
@@ -103,24 +93,24 @@ class LockstepChannel(RosChannel):
         return not stop
 
     def _wait(self, slot: int, waited_s: float, repeat: float) -> float:
-        """No answer has come: complain if that takes too long; says when the slot was last sent."""
+        """No answer has come: complain if that takes too long; return when the slot was last sent."""
         now = time.monotonic()
         if self._complaint and now > self._complaint_time + _GARBAGE_PATIENCE_S:
             raise RemoteProtocolError(f"{named(self.answers.silent)} sent garbage in slot {slot}: {self._complaint}")
         limit = self._answer_s if slot else self._startup_s
         if waited_s > limit:
-            raise LocalProtocolError(
-                f"{named(self.answers.silent)} did not answer slot {slot} within {limit:g} s: dead or hung?"
-            )
-        if now - repeat > (_REPEAT_LATER_S if slot else _REPEAT_S):
+            silent = named(self.answers.silent)
+            raise LocalProtocolError(f"{silent} did not answer slot {slot} within {limit:g} s: dead or hung?")
+        if now - repeat > (_REPEAT_LATER_S if slot else REPEAT_S):
             self._publisher.publish(self._bytes)
             return now
         return repeat
 
-    def _take(self, slot: int, data: bytes) -> bool:
-        """Takes in one message; whether it is an answer that was missing."""
+    def _accept(self, slot: int, data: bytes) -> bool:
+        """Check one message; return whether it is an answer that was missing."""
         try:
-            message = self._decoded(data)
+            message = self._decoded(data, Transmission, TRANSMISSION.read_fields)
+            self.roster.check_sender(message.agent, time.monotonic(), self.loop.sender)
             if message.slot < slot:
                 return False  # an answer that was asked for twice
             if message.slot > slot:
@@ -134,20 +124,3 @@ class LockstepChannel(RosChannel):
         if fresh:
             self._observers.answer_received(slot, message.agent.tobytes(), data)
         return fresh
-
-    def _decoded(self, data: bytes) -> TransmissionFields | Transmission:
-        """A transmission message of one of this run's processes; where it is laid out as usual, its fields.
-
-        :raises Unusable: if it is none.
-        """
-        message = read_transmission(data, self.answers.steps)
-        try:
-            if message is None:
-                message = deserialize_message(data, Transmission)
-        except Exception as error:  # rclpy has no common base for what a message can do to it
-            said = (str(error).splitlines() or [""])[0]
-            raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no Transmission ({said})") from None
-        if message.run != self.run_id:
-            raise Unusable(OTHER_RUN, f"an answer of run {run_text(message.run)}")
-        self.roster.check_sender(message.agent, self.loop.number, time.monotonic(), self.loop.sender)
-        return message

@@ -1,13 +1,14 @@
-"""Observers of the channel, which are told what happens, and the referee, which says when the run is over."""
+"""Observers of the channel, which are called when something happens, and the referee, which ends a run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common.wire.report_fields import ReportFields
+from dtsa_agent.ros.common.wire.messages import Fields
 from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import Verdict
 
@@ -26,15 +27,14 @@ class ChannelStatus:
     """How the channel is doing."""
 
     slot: int  # the last one opened (lockstep) or closed (real time); -1: none yet
-    dropped: dict[str, int]  # messages and frames not taken in, by reason
+    dropped: dict[str, int]  # messages and frames that were not received, by reason
     awaited: list[int]  # ids of the agents whose answers are missing
-    lag_ms: float = 0.0  # by how much the channel is late now, in real time
 
 
 class ChannelObserver:
     """Events of a run. An observer derives from this class and overrides those that it needs; the rest costs nothing.
 
-    Observers are told in the order in which they were added. None of them can change what happens on the air. A slot
+    Observers are called in the order in which they were added. None of them can change what happens on the air. A slot
     passes in this order: ``slot_published`` and ``answer_received`` as messages go out and come in, ``all_answered``,
     ``judged``, ``slot_over``. Answers are valid during the call. Messages are CDR, times ns of simulated time.
     """
@@ -48,8 +48,8 @@ class ChannelObserver:
     def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
         """A usable frame message has come in, in real time only; its transmission starts at ``time_ns``."""
 
-    def report(self, message: ReportFields, data: bytes) -> None:
-        """A usable report has come in, in real time only; it may tell of slots that are over."""
+    def report(self, message: Fields, data: bytes) -> None:
+        """A usable report has come in, in real time only; it may be of slots that are over."""
 
     def begun(self, at_s: float) -> None:
         """It is known when slot 0 starts, s of ``time.monotonic()``, in real time only."""
@@ -64,7 +64,7 @@ class ChannelObserver:
         """The air has carried a slot's frames, by the sender's id."""
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
-        """The slot is over: time for what nobody waits for."""
+        """The slot is over: time for what no agent waits for."""
 
     def agent_silent(self, agent: int) -> None:
         """An agent has fallen silent, in real time only."""
@@ -101,8 +101,7 @@ class SlotLimit(Referee):
     """Ends a run after a number of slots; 0: never."""
 
     def __init__(self, slots: int = 0) -> None:
-        self._slots = slots
-        self._over = False
+        self._slots, self._over = slots, False
 
     def over(self, slot: int, answers: Answers) -> bool:
         self._over = 0 < self._slots <= slot
@@ -114,55 +113,54 @@ class SlotLimit(Referee):
 
 
 class Observers(ChannelObserver):
-    """Passes every event on to any number of observers."""
+    """Passes every event on to any number of observers; an error of one that is no DtsaError names it."""
 
     def __init__(self) -> None:
-        self._told: dict[str, list[tuple[ChannelObserver, Callable[..., None]]]] = {name: [] for name in _EVENTS}
+        self._calls: dict[str, list[Callable[..., None]]] = {name: [] for name in _EVENTS}
 
     def add(self, observer: ChannelObserver) -> None:
-        """Add an observer; it is told after those that are there already."""
+        """Add an observer; it is called after those that are there already."""
         for name in _EVENTS:
             if getattr(type(observer), name) is not getattr(ChannelObserver, name):
-                self._told[name].append((observer, getattr(observer, name)))
+                self._calls[name].append(_naming(observer, getattr(observer, name)))
 
     def close(self) -> None:
         """Close all observers, also when some of them fail.
 
         :raises DtsaError: the first failure.
         """
-        told, self._told["close"] = self._told["close"], []
-        failures = [failure for entry in told if (failure := _failure(*entry))]
-        if failures:
-            raise failures[0]
+        if not self._calls["close"]:
+            return
+        close = self._calls["close"].pop(0)
+        try:
+            close()
+        except DtsaError:
+            with suppress(DtsaError):
+                self.close()
+            raise
+        self.close()
 
 
-def _call(observer: ChannelObserver, call: Callable[..., None], *arguments: object) -> None:
-    """Tell an observer of an event; an error that is no DtsaError names it."""
-    try:
-        call(*arguments)
-    except DtsaError:
-        raise
-    except Exception as error:
-        raise ObserverError(observer, error) from error
+def _naming(observer: ChannelObserver, event: Callable[..., None]) -> Callable[..., None]:
+    def call(*arguments: object) -> None:
+        try:
+            event(*arguments)
+        except DtsaError:
+            raise
+        except Exception as error:
+            raise ObserverError(observer, error) from error
 
-
-def _failure(observer: ChannelObserver, close: Callable[..., None]) -> DtsaError | None:
-    try:
-        _call(observer, close)
-    except DtsaError as error:
-        return error
-    return None
+    return call
 
 
 def _forward(event: str) -> Any:
     def forward(self: Observers, *arguments: object) -> None:
-        for observer, call in self._told[event]:
-            _call(observer, call, *arguments)
+        for call in self._calls[event]:
+            call(*arguments)
 
     return forward
 
 
 _EVENTS = tuple(name for name, member in vars(ChannelObserver).items() if name[0] != "_" and callable(member))
-for _event in _EVENTS:
-    if _event != "close":
-        setattr(Observers, _event, _forward(_event))
+for _event in set(_EVENTS) - {"close"}:
+    setattr(Observers, _event, _forward(_event))

@@ -3,60 +3,156 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
+from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
 from dtsa_msgs.msg import Frame, Report, Slot
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import deserialize_message
 
-from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.core.agents.delays import Delays
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.loop import Feed
-from dtsa_agent.ros.common.process.runs import run_text
-from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire.checks import OTHER_RUN, RANGE, SIZES, UNREADABLE, Unusable, check_start
-from dtsa_agent.ros.common.wire.report_fields import ReportFields, read_report
-from dtsa_agent.ros.common.wire.stamps import header_of, ns_of, time_of
-from dtsa_channel_sim.model.air import FrameVerdict
+from dtsa_agent.ros.common.wire.checks import RANGE, SIZES, Unusable, check_start
+from dtsa_agent.ros.common.wire.messages import Fields, header_of, ns_of, read_report
+from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
+from dtsa_channel_sim.model.medium import Positions
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .accounts import Accounts, Delivered
-from .answers import Answers
-from .attendance import Attendance
-from .live_air import LiveAir, Sent, slot_verdict
-from .pace import Pace
-from .roll_call import RollCall
-from .ros_channel import RosChannel, put_frames
+from .answers import Accounts, Answers, Delivered
+from .ros_channel import RosChannel
+from .roster import Attendance, RollCall
 
 _NS = 1_000_000_000
 _TICK_NS = 2_000_000  # longest wait for a frame
-_REPEAT_S = 0.1
-_TELL_S = 1.0  # the start is told again so often, for processes that come later
+_START_S = 1.0  # the start is published again so often, for processes that come later
 _LEAD_NS = 300_000_000  # from the start message to slot 0
 _PATIENCE_SLOTS, _PATIENCE_NS = 10, 500_000_000  # an account waits for reports at least so long
 # After a stall the middleware repeats some messages only when its writers ask for acknowledgements, every 3 s.
 _RECOVERY_NS = 4 * _NS
 _AHEAD = 100  # slots: a report from farther in the future is none
-_KEEP_NS = 10 * _NS  # an agent may tell so late that it took in a frame
+_KEEP_NS = 10 * _NS  # an agent may report so late that it received a frame
 # What one pass of the loop does at most: frames, reports. Then it looks at the clock and at signals again.
 _FRAMES, _REPORTS = 64, 2
 _TIGHT = 0.6  # of a slot: a round of messages that takes longer leaves too little for the rest
+_GRACE = 0.05  # of a slot: frames are handed over ahead of their start; one that is late by less still collides
+_WINDOW = 0.5  # of a slot: a frame that reaches the channel later than this after its start is dropped
+_STALL_SLOTS, _STALL_NS = 5, 50_000_000
+_MOST_STALLS = 1000  # kept one by one; later ones are only counted
+_BEHIND_NS, _TOO_LONG_NS = 1 * _NS, 8 * _NS  # a run that is that far behind for that long will not catch up
 
+Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
 _read_frame = partial(deserialize_message, message_type=Frame)
+
+
+class Pace:
+    """Whether the channel keeps up with its time line: how late it is, and when it stood still.
+
+    Follows the passes of the channel's loop. Times are ns from the start of slot 0.
+    """
+
+    def __init__(self, slot_ns: int) -> None:
+        self._stall_ns = max(_STALL_SLOTS * slot_ns, _STALL_NS)
+        self._last_ns = 0
+        self.lag = Delays()  # from when a frame could have been delivered to when it was
+        self.stalls: list[tuple[int, int]] = []  # ns from the start of slot 0: from, to
+        self.stall_count = 0
+        self.last_stall = (0, 0)
+        self._behind_since_ns: int | None = None
+
+    def passed(self, now_ns: int) -> int:
+        """The next pass begins; return for how long the channel stood still before it, ns, 0 if it did not."""
+        gap, begun = now_ns - self._last_ns, self._last_ns
+        self._last_ns = now_ns
+        if gap < self._stall_ns:
+            return 0
+        self.stall_count += 1
+        if len(self.stalls) < _MOST_STALLS:
+            self.stalls.append((begun, now_ns))
+        self.last_stall = begun, now_ns
+        return gap
+
+    def falls_behind(self, now_ns: int, done_ns: int) -> bool:
+        """Whether a run that should have come to ``done_ns`` by now is too far behind for too long to catch up."""
+        if now_ns - done_ns < _BEHIND_NS:
+            self._behind_since_ns = None
+            return False
+        if self._behind_since_ns is None:
+            self._behind_since_ns = now_ns
+        return now_ns - self._behind_since_ns > _TOO_LONG_NS
+
+    @property
+    def behind_since_s(self) -> float:
+        """Since when the run has been behind, s from the start of slot 0."""
+        return (self._behind_since_ns or 0) / _NS
+
+
+class LiveAir:
+    """One time line of frames: time is settled a little behind the clock, when all handed over in time is known.
+
+    Times are ns from the start of slot 0, positions (3, N), m, frame map.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        config = channel.config
+        self._air: Air[Sent] = Air(channel)
+        # A delivery may come no earlier than the frame arrives.
+        self.hold_ns = max(round(_GRACE * config.slot_ns), config.airtime.from_radio_ns(0))
+        self.late = 0  # frames that came when the air had been settled past their start, and were dropped
+        self._window_ns = round(_WINDOW * config.slot_ns)
+        self.frames: dict[Sent, bytes] = {}  # that are or were on the air, until their slot is closed
+        self._arriving: list[tuple[int, int, FrameVerdict[Sent]]] = []  # what lines still carry: a heap by arrival
+        self._count = 0
+        self._settled_ns = -NEVER
+
+    @property
+    def waits(self) -> bool:
+        """Whether a frame waits for its delivery."""
+        return bool(self._air.pending or self._arriving)
+
+    def hand_over(self, key: Sent, start_ns: int, data: bytes) -> bool:
+        """Put a frame on the air at ``start_ns``; return False if it came too late."""
+        if not self._air.begin(key, key[1], start_ns, len(data)):
+            self.late += 1
+            return False
+        self.frames[key] = data
+        return True
+
+    def settle(self, now: int, positions: Positions) -> list[FrameVerdict[Sent]]:
+        """Return the verdicts on all frames that have arrived."""
+        ripe, late = now - self.hold_ns, now - max(self.hold_ns, self._window_ns)
+        while (due := self._air.due_ns) <= ripe:
+            self._settle(due, positions)
+        self._settle(late, positions)
+        arrived = []
+        while self._arriving and self._arriving[0][0] <= now:
+            arrived.append(heappop(self._arriving)[2])
+        return arrived
+
+    def _settle(self, until_ns: int, positions: Positions) -> None:
+        if until_ns <= self._settled_ns:
+            return
+        self._settled_ns = until_ns
+        for verdict in self._air.settle(until_ns, positions):
+            self._count += 1
+            heappush(self._arriving, (verdict.arrival_ns, self._count, verdict))
+
+    def spare_ns(self, now: int, most_ns: int) -> int:
+        """Return for how long there is nothing to do, ns, at most ``most_ns``."""
+        arrival = self._arriving[0][0] if self._arriving else NEVER
+        return min(max(0, min(self._air.due_ns + self.hold_ns, arrival) - now), most_ns)
 
 
 class RealtimeChannel(RosChannel):
     """Medium of a swarm whose agents have clocks of their own.
 
-    Slots are the channel's own. An agent that falls silent is missed, but nobody waits for it. Frames come apart from
-    all else and are dealt with first; what the agents report fills an account of each slot, in which frames are long
+    Slots are the channel's own. An agent that falls silent is missed, but not waited for. Frames come apart from all
+    else and are dealt with first; what the agents report fills an account of each slot, in which frames are long
     delivered.
     """
 
@@ -72,8 +168,8 @@ class RealtimeChannel(RosChannel):
         **more: Any,
     ) -> None:
         super().__init__(
-            node, channel, steps, waiting=names.REALTIME_WAITING, swarm_namespace=swarm_namespace,
-            input_type=Frame, input_topic=names.AIR_FRAME, **more,
+            node, channel, steps, names.REALTIME_WAITING, (Frame, names.AIR_FRAME), swarm_namespace=swarm_namespace,
+            **more,
         )  # fmt: skip
         qos = names.lockstep_qos(names.REALTIME_WAITING * self.agents)
         self._reports = Feed(node, Report, f"{swarm_namespace}/{names.REPORT}", qos, raw=True)
@@ -84,11 +180,11 @@ class RealtimeChannel(RosChannel):
         self._attendance = Attendance(self.agents, self.lost)
         self._steps = steps
         self._zero = 0
-        self._told = 0.0  # time.monotonic() of the last start message
-        self._leisure_ns = -(2**63)  # when there was time for all that is not the air
+        self._start_published_s = 0.0  # time.monotonic() of the last start message
+        self._leisure_ns = -NEVER  # when there was time for all that is not the air
         self._settled: dict[int, list[FrameVerdict[Sent]]] = {}
         self._recovered_ns = 0  # when all that was sent during the last stall should have come
-        self._newest = -1  # slot: last one reported by anybody
+        self._newest = -1  # slot: last one reported by any agent
         self._lag_ns = 0  # the swarm's common time runs with the mean of its clocks: its slots start so much later
         airtime = channel.config.airtime
         self._longest = airtime.longest
@@ -106,19 +202,10 @@ class RealtimeChannel(RosChannel):
         return self.accounts.missed
 
     def _run(self, stop: object) -> None:
-        """Runs until the run is over, cannot keep up, or ``stop`` is true.
-
-        :raises LocalProtocolError: when an agent does not report at the start.
-        :raises DtsaError: when an observer fails.
-        """
-        try:
-            if self._prepare(stop):
-                self._fly(stop)
-        finally:
-            self._publish_end()
+        if self._prepare(stop):
+            self._fly(stop)
 
     def close(self) -> None:
-        """As for all channels."""
         try:
             super().close()
         finally:
@@ -127,13 +214,13 @@ class RealtimeChannel(RosChannel):
     # Who takes part.
 
     def expect_later(self, agent: int, place: NDArray[np.float64]) -> None:
-        """An agent will not be there at the start; its vehicle waits at a place, (3,) m."""
+        """Note that an agent comes after the start; its vehicle waits at a place, (3,) m."""
         self.answers.track[:, :, agent - 1] = place
         self.lose(agent)
         self._attendance.expect_later(agent)
 
     def lose(self, agent: int) -> None:
-        """Takes note that an agent is gone."""
+        """Note that an agent is gone."""
         if self._attendance.lose(agent, self._now() // self.slot_ns):
             self._observers.agent_silent(agent)
 
@@ -143,40 +230,33 @@ class RealtimeChannel(RosChannel):
         return self._attendance.returned
 
     def last_place(self, agent: int) -> NDArray[np.float64]:
-        """Where an agent has reported to be last, (3,) m."""
+        """Return the last position that an agent has reported, (3,) m."""
         place = self.accounts.last_place(agent)
         return self.answers.position[:, agent - 1] if place is None else place
 
     # Before slot 0.
 
     def _prepare(self, stop: object) -> bool:
-        """Waits until all agents have reported, and tells them when slot 0 starts."""
+        """Wait until all agents have reported, and publish when slot 0 starts; return False when stopped."""
         if not self._call(stop, self.lost):
             return False
         accounts = Accounts(self.agents, self._steps, 1)
         roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling, accounts)
-        patience, repeat = Patience(), 0.0
         everybody = set(range(1, self.agents + 1))
         awaited = set(everybody)
-        while awaited - self.lost:
-            if stop:
-                return False
-            now = time.monotonic()
-            if now - repeat > _REPEAT_S:
-                repeat = now
-                roll_call.call()
-            self.loop.wait(_TICK_NS)
-            awaited -= roll_call.present()
+
+        def look() -> set[int]:
+            awaited.difference_update(roll_call.present())
             self.answers.missing = len(awaited)
             self.answers.answered[:] = [agent not in awaited for agent in range(1, self.agents + 1)]
-            self._housekeeping()
-            if patience.look() > self._startup_s:
-                missing = named(awaited - self.lost)
-                raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
-        # Nobody who is late with its first report has been anywhere else.
-        told = roll_call.told
-        told.carry(self.answers)
-        self.answers = told
+            return awaited - self.lost
+
+        if not self._await_all(stop, roll_call.call, look, _TICK_NS):
+            return False
+        # An agent that is late with its first report has been nowhere else.
+        answers = roll_call.answers
+        answers.carry(self.answers)
+        self.answers = answers
         absent = set(self.lost)
 
         def disturbed() -> bool:
@@ -187,7 +267,7 @@ class RealtimeChannel(RosChannel):
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS
-        self._tell_start()
+        self._publish_start()
         self._observers.begun(self._zero / _NS)
         self._attendance.begin()
         return True
@@ -197,8 +277,8 @@ class RealtimeChannel(RosChannel):
         """Whether a round of messages before slot 0 took so much of a slot that the machine may not keep up."""
         return self.round_ms is not None and self.round_ms * 1e6 > _TIGHT * self.slot_ns
 
-    def _tell_start(self) -> None:
-        self._told = time.monotonic()
+    def _publish_start(self) -> None:
+        self._start_published_s = time.monotonic()
         header = header_of(self._zero)
         self._publisher.publish(Slot(header=header, run=self.run_id, phase=Slot.START, data=self._calling))
 
@@ -220,19 +300,19 @@ class RealtimeChannel(RosChannel):
                 if data is None:
                     break
                 with self.intake.guard():
-                    self._take_frame(data)
+                    self._accept_frame(data)
                 data = self.loop.take()
             now = self._now()
             self._settle(now)
             more = False
             if self._at_leisure(now):
-                more = self._take_reports()
+                more = self._read_reports()
                 if self._due(now):
                     if not self._close_slot():
                         return
                     more = more or self._due(now)
-                if time.monotonic() - self._told > _TELL_S:
-                    self._tell_start()
+                if time.monotonic() - self._start_published_s > _START_S:
+                    self._publish_start()
                 self._housekeeping()
             if self._falls_behind(now):
                 return
@@ -267,21 +347,8 @@ class RealtimeChannel(RosChannel):
         )
         return True
 
-    def _decoded(self, data: bytes, kind: type, read: Callable[[bytes], Any]) -> Any:
-        """A message of this run.
-
-        :raises Unusable: if it is none.
-        """
-        try:
-            message = read(data)
-        except Exception:  # rclpy has no common base for what a message can do to it
-            raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
-        if message.run != self.run_id:
-            raise Unusable(OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
-        return message
-
-    def _take_frame(self, data: bytes) -> None:
-        """Lays a frame on the time line.
+    def _accept_frame(self, data: bytes) -> None:
+        """Put a frame on the time line.
 
         :raises Unusable: if it cannot be one.
         """
@@ -289,7 +356,7 @@ class RealtimeChannel(RosChannel):
         slot, agent, length = message.slot, message.agent, len(message.data)
         if agent in self.lost:
             self._meet_processes()  # a new process tells about itself before it sends anything else
-        self.roster.check_frame(agent, self.loop.number, time.monotonic(), self.loop.sender)
+        self.roster.check_frame(agent, time.monotonic(), self.loop.sender)
         start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
         if not 1 <= length <= self._longest:
             raise Unusable(SIZES, f"a frame of {length} bytes")
@@ -298,56 +365,54 @@ class RealtimeChannel(RosChannel):
         check_start(start_ns, now, early_ns=_AHEAD * self.slot_ns)
         check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
         key = (slot, agent)
-        if self.air.holds(key):
+        if key in self.air.frames:
             return
         if not self.air.hand_over(key, start_ns, bytes(message.data)):
-            return  # too late: nobody hears it
+            return  # too late: no agent hears it
         if slot > self.slot:
             self.accounts[slot].frames[agent] = bytes(message.data)
         self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, start_ns))
         self._attendance.hear((agent,), now)
 
     def _settle(self, now: int) -> None:
-        """Delivers all frames whose time has come."""
+        """Deliver all frames whose time has come."""
         for verdict in self.air.settle(now, self.answers.position):
             self._deliver(verdict)
 
     def _deliver(self, verdict: FrameVerdict[Sent]) -> None:
-        """Sends a frame that has left the air to those that received it."""
+        """Send a frame that has left the air to those that received it."""
         slot, sender = verdict.frame_id
         self._settled.setdefault(max(slot, self.slot + 1), []).append(verdict)
         self.pace.lag.add(self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns))
         if not verdict.received.any():
             return
-        frame = self.air.frame(verdict.frame_id)
+        frame = self.air.frames[verdict.frame_id]
         time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
-        message = Slot(header=header_of(time_ns), run=self.run_id, slot=slot, phase=Slot.RUN, heard_slot=slot)
-        put_frames(message, [sender], [frame], verdict.received[None])
-        data = bytes(serialize_message(message))
+        data = self._pack_slot(time_ns, slot, slot, (sender,), (frame,), verdict.received[None])
         self._publisher.publish(data)
         self.accounts.deliver(slot, sender, Delivered(frame, verdict.arrival_ns, verdict.received))
         self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
 
     # The accounts.
 
-    def _take_reports(self) -> bool:
-        """Takes in some reports; whether there may be more."""
+    def _read_reports(self) -> bool:
+        """Read some reports; return whether there may be more."""
         for _ in range(_REPORTS):
             data = self._reports.take()
             if data is None:
                 return False
             with self.intake.guard():
-                self._take_report(self._decoded(data, Report, read_report), data)
+                self._accept_report(self._decoded(data, Report, read_report), data)
         return True
 
-    def _take_report(self, message: ReportFields, data: bytes) -> None:
-        """Takes in one process's report.
+    def _accept_report(self, message: Fields, data: bytes) -> None:
+        """Add one process's report to the accounts.
 
         :raises Unusable: if it cannot be one.
         """
         if self.lost and not self.lost.isdisjoint(message.agent[: self.agents]):
             self._meet_processes()
-        self.roster.check_sender(message.agent, self._reports.number, time.monotonic(), self._reports.sender)
+        self.roster.check_sender(message.agent, time.monotonic(), self._reports.sender)
         now = self._now()
         if len(message.slot) and message.slot[0] >= names.FIRST_CALL:
             return  # an answer to a call, which has come late
@@ -366,7 +431,7 @@ class RealtimeChannel(RosChannel):
         return silent is not None and not set(silent) - self.lost
 
     def _close_slot(self) -> bool:
-        """Tells the observers of a slot that has passed; False when the run is over."""
+        """Tell the observers of a slot that has passed; return False when the run is over."""
         slot = self.slot + 1
         book = self._completed(slot)
         if not slot and not self._goes_on(0, book):
@@ -375,7 +440,7 @@ class RealtimeChannel(RosChannel):
         frames, verdict = self._verdict(slot)
         book.taken_in = self.accounts.taken_in(slot)
         self._observers.judged(slot, book, frames, verdict)
-        self._tell_time(time_of(names.slot_time_ns(slot, self.slot_ns)))
+        self._publish_clock(names.slot_time_ns(slot, self.slot_ns))
         self._observers.slot_over(slot, book, verdict)
         self.slot = slot
         here = book.answered.copy()
@@ -387,7 +452,7 @@ class RealtimeChannel(RosChannel):
         return self._goes_on(slot + 1, following)
 
     def _completed(self, slot: int) -> Answers:
-        """A slot's reports, those that are missing taken from the slot before."""
+        """Return a slot's reports, those that are missing copied from the slot before."""
         book = self.accounts[slot]
         again = self._attendance.back(slot, book.answered) if self.lost else []
         if again:
@@ -398,6 +463,7 @@ class RealtimeChannel(RosChannel):
         return book
 
     def _verdict(self, slot: int) -> tuple[dict[int, bytes], Verdict]:
-        """What the air did in one slot, frame by frame."""
+        """Return what the air did in one slot, frame by frame."""
         settled = self._settled.pop(slot, [])
-        return {verdict.sender: self.air.forget(verdict.frame_id) for verdict in settled}, slot_verdict(settled)
+        frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in settled}
+        return frames, Verdict.of([verdict.sender for verdict in settled], settled)

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from typing import Any
 
-from builtin_interfaces.msg import Time
-from dtsa_msgs.msg import Process, Slot, Transmission
+from dtsa_msgs.msg import Process, Slot
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
@@ -19,10 +18,11 @@ from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.loop import Feed, Loop
-from dtsa_agent.ros.common.process.runs import Run
+from dtsa_agent.ros.common.process.runs import Run, run_text
 from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, check_slot
-from dtsa_agent.ros.common.wire.intake import Intake, add_counts
+from dtsa_agent.ros.common.wire import checks
+from dtsa_agent.ros.common.wire.checks import Intake, Unusable
+from dtsa_agent.ros.common.wire.messages import SLOT, time_of
 from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
@@ -31,22 +31,23 @@ from .answers import Answers
 from .observer import ChannelObserver, ChannelStatus, Observers, Referee, SlotLimit
 from .roster import Roster
 
-_REPEAT_S = 0.1
+REPEAT_S = 0.1
 _CALL_NS = 5_000_000
-_OTHER_CHANNEL_S = 0.3  # whoever calls or opens slots for so long is a channel
+_OTHER_CHANNEL_S = 0.3  # a node that calls or opens slots for so long is a channel
 _NAME_S = 1.0  # that the name of its node is waited for
 _UNNAMED = "a node whose name the graph does not know"
-_MOST_PROCESSES = 64  # messages of processes taken in at a time
+_MOST_PROCESSES = 64  # messages of processes read at a time
 _HURRY_S = 0.2
 
 
 class RosChannel:
     """A medium whose agents are nodes.
 
-    It tells its observers what happens; a referee says when the run is over.
+    It calls its observers when something happens; a referee says when the run is over.
 
+    :param waiting: a quarter of the messages of an agent that may wait to be read.
+    :param input: type and topic of the messages that the loop waits for.
     :param referee: ends the run; None: a signal does.
-    :param swarm_namespace: namespace of the swarm's topics.
     :param startup_s: s of wall time that all agents have to answer for the first time.
     :param end_s: s of wall time that the nodes have to hear of the end.
     :param run: the run's id, which all its messages carry; None: a new one.
@@ -61,14 +62,13 @@ class RosChannel:
         channel: Channel,
         steps: int,
         waiting: int,
+        input: tuple[type, str],
         referee: Referee | None = None,
         swarm_namespace: str = names.SWARM,
         startup_s: float = 60.0,
         end_s: float = 4.0,
         run: Run | None = None,
         agreed: Mapping[str, Any] | None = None,
-        input_type: type = Transmission,
-        input_topic: str = names.TRANSMISSION,
     ) -> None:
         self.node, self.model = node, channel
         self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
@@ -85,14 +85,15 @@ class RosChannel:
         self._publisher = node.create_publisher(Slot, f"{swarm_namespace}/{names.SLOT}", names.lockstep_qos(waiting))
         self._clock = node.create_publisher(Clock, names.clock_topic(swarm_namespace), 10)
         self._clock_watched = False
-        answers_qos = names.lockstep_qos(waiting * self.agents)
-        self.loop = Loop(node, input_type, f"{swarm_namespace}/{input_topic}", answers_qos, raw=True)
+        kind, topic = input
+        qos = names.lockstep_qos(waiting * self.agents)
+        self.loop = Loop(node, kind, f"{swarm_namespace}/{topic}", qos, raw=True)
+        name = node.get_fully_qualified_name()
         settings = {"agents": self.agents, "slot_ms": self.slot_ns / 1e6, "steps": steps, "mode": self.mode}
-        self.roster = Roster(self.agents, self._identity.number, agreed or settings, node.get_fully_qualified_name())
-        self._processes = Feed(
-            node, Process, f"{swarm_namespace}/{names.PROCESS}", names.lockstep_qos(self.agents), intake=self.intake
-        )
-        self._calling = array("B", self._identity.call(node.get_fully_qualified_name()))
+        self.roster = Roster(self.agents, self.run_id, agreed or settings, name)
+        topic, qos = f"{swarm_namespace}/{names.PROCESS}", names.lockstep_qos(self.agents)
+        self._processes = Feed(node, Process, topic, qos, intake=self.intake)
+        self._calling = array("B", self._identity.call(name))
 
     @property
     def run_id(self) -> int:
@@ -101,27 +102,34 @@ class RosChannel:
 
     @property
     def unusable(self) -> int:
-        """Number of messages that the channel has not taken in."""
+        """Number of messages that the channel has dropped."""
         return self.intake.total
 
     def dropped(self) -> dict[str, int]:
-        """Messages and frames that the channel and the agents have not taken in, by reason."""
+        """Return the number of messages and frames that the channel and the agents have dropped, by reason."""
         total = dict(self.intake.counts)
-        add_counts(total, self.roster.dropped())
+        checks.add_counts(total, self.roster.dropped())
         return total
 
     def observe(self, *observers: ChannelObserver) -> None:
-        """Adds observers; they are told in this order, after those that are there already."""
+        """Add observers; they are called in this order, after those that are there already."""
         for observer in observers:
             self._observers.add(observer)
 
+    def change_settings(self, change: Change) -> None:
+        """Tell the observers of a change of the medium's settings."""
+        self._observers.settings_changed(change)
+
     def run(self, stop: object) -> None:
-        """Runs until the run is over or ``stop`` is true. The agents are told to end.
+        """Run until the run is over or ``stop`` is true. The agents are told to end.
 
         :raises DtsaError: when an agent or an observer fails.
         """
         try:
-            self._run(stop)
+            try:
+                self._run(stop)
+            finally:
+                self._publish_end()
             cut_short = self.fell_behind or str(getattr(stop, "reason", ""))
             self._reason = self._referee.reason or cut_short or ("stopped by a signal" if stop else "")
         except DtsaError as error:
@@ -131,45 +139,51 @@ class RosChannel:
     def _run(self, stop: object) -> None:
         raise NotImplementedError
 
-    def change_settings(self, change: Change) -> None:
-        """Tells the observers of a change of the medium's settings."""
-        self._observers.settings_changed(change)
-
     # For the two modes.
 
     def _call(self, stop: object, absent: Set[int] = frozenset()) -> bool:
-        """Calls the agents until all have shown who they are and what they fly with; False when stopped.
+        """Call the agents until all have shown their ids and settings; return False when stopped.
 
         :raises ConfigError: when two do not fit together, or another channel is there.
         :raises LocalProtocolError: when some do not answer in time.
         """
         with self._other_channels() as look_for_others:
-            return self._introduce_all(stop, absent, look_for_others)
 
-    def _introduce_all(self, stop: object, absent: Set[int], look_for_others: Callable[[], None]) -> bool:
+            def call() -> None:
+                data = self._calling
+                self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, slot=names.FIRST_CALL, data=data))
+
+            def look() -> set[int]:
+                self._hear_processes()
+                look_for_others()
+                done = self.roster.complete(time.monotonic(), absent)
+                return set() if done else set(self.roster.missing) - absent or {0}
+
+            self.roster.closed = self._await_all(stop, call, look, _CALL_NS)
+        return self.roster.closed
+
+    def _await_all(self, stop: object, call: Callable[[], None], look: Callable[[], set[int]], wait_ns: int) -> bool:
+        """Call again and again until no agent is awaited any more; return False when stopped.
+
+        :raises LocalProtocolError: when some do not answer in time.
+        """
         patience, repeat = Patience(), 0.0
-        while not self.roster.complete(time.monotonic(), absent):
+        while awaited := look():
             if stop:
                 return False
             now = time.monotonic()
-            if now - repeat > _REPEAT_S:
+            if now - repeat > REPEAT_S:
                 repeat = now
-                self._publisher.publish(
-                    Slot(run=self.run_id, phase=Slot.PREPARE, slot=names.FIRST_CALL, data=self._calling)
-                )
-            self.loop.wait(_CALL_NS)  # what is said before the run begins does not count
-            self._hear_processes()
-            look_for_others()
+                call()
+            self.loop.wait(wait_ns)  # what comes before the run begins does not count
             self._housekeeping()
             if patience.look() > self._startup_s:
-                missing = named(set(self.roster.missing) - absent)
-                raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
-        self.roster.close()
+                raise LocalProtocolError(f"{named(awaited)} did not report within {self._startup_s:g} s: dead or hung?")
         return True
 
     @contextmanager
     def _other_channels(self) -> Iterator[Callable[[], None]]:
-        """Listens to the channel's own topic; gives a function that takes in what others say there."""
+        """Listen to the channel's own topic; give a function that checks what others publish there."""
         topic = self._publisher.topic_name
         feed = Feed(self.node, Slot, topic, names.lockstep_qos(), intake=self.intake)
         heard: dict[int, float] = {}  # by run: when it was first heard
@@ -182,7 +196,7 @@ class RosChannel:
                 if message.run in (0, self.run_id) or len(heard) >= _MOST_PROCESSES:
                     continue
                 with self.intake.guard():
-                    check_slot(message, self.agents)
+                    checks.check_slot(message, self.agents)
                     now = time.monotonic()
                     waited = now - heard.setdefault(message.run, now)
                     others = ", ".join(self._other_nodes(topic)) if waited > _OTHER_CHANNEL_S else ""
@@ -197,18 +211,39 @@ class RosChannel:
             self.node.destroy_subscription(feed.subscription)
 
     def _other_nodes(self, topic: str) -> list[str]:
-        """Nodes that publish on a topic beside this one."""
-        found = self.node.get_publishers_info_by_topic(topic)
+        """Return the nodes that publish on a topic beside this one."""
         nodes = [
             _UNNAMED if "UNKNOWN_" in info.node_name else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            for info in found
+            for info in self.node.get_publishers_info_by_topic(topic)
         ]
         if self.node.get_fully_qualified_name() in nodes:
             nodes.remove(self.node.get_fully_qualified_name())
         return nodes or ["one that has just gone"]
 
+    def _decoded(self, data: bytes, kind: type, read: Callable[[bytes], Any]) -> Any:
+        """Return a message of this run.
+
+        :raises Unusable: if it is none.
+        """
+        try:
+            message = read(data)
+        except Exception:  # rclpy has no common base for what a message can do to it
+            raise Unusable(checks.UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
+        if message.run != self.run_id:
+            raise Unusable(checks.OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
+        return message
+
+    def _pack_slot(
+        self, time_ns: int, slot: int, heard_slot: int, senders: Any = (), frames: Any = (), mask: Any = None
+    ) -> bytes:
+        """Return the message that opens a slot or delivers frames, by their receivers' mask (F, N)."""
+        return SLOT.pack(time_ns, (
+            self.run_id, slot, Slot.RUN, heard_slot, array("H", senders).tobytes(), bytes(map(len, frames)),
+            b"".join(frames), b"" if mask is None else pack_received(mask),
+        ))  # fmt: skip
+
     def _hear_processes(self) -> None:
-        """Takes in what processes say about themselves.
+        """Process what processes say about themselves.
 
         :raises ConfigError: before the run has begun, when two do not fit together.
         """
@@ -223,41 +258,38 @@ class RosChannel:
                     self._refuse(message.process, error)
                     if not self.roster.closed:
                         raise
-                    self.intake.drop(OTHER_SENDER, f"{message.node}: {error}")
+                    self.intake.drop(checks.OTHER_SENDER, f"{message.node}: {error}")
 
     def _refuse(self, process: int, error: ConfigError) -> None:
-        """Tells a process that it cannot take part."""
+        """Tell a process that it cannot take part."""
         reason = json.dumps([error.field, error.value, error.allowed], default=str).encode()
         data = array("B", process.to_bytes(8, "little") + reason)
         self._publisher.publish(Slot(run=self.run_id, phase=Slot.REFUSE, data=data))
+
+    def _meet_processes(self) -> None:
+        """Process what processes say about themselves, and decide about those that came late."""
+        self._hear_processes()
+        for process, error in self.roster.settle(time.monotonic(), self.lost) if self.roster.closed else ():
+            self._refuse(process, error)
 
     def _housekeeping(self) -> None:
         if self.loop.housekeeping():
             self._clock_watched = self._clock.get_subscription_count() > 0
             self._meet_processes()
-            self._idle()
-
-    def _meet_processes(self) -> None:
-        """Takes in what processes say about themselves, and decides about those that came late."""
-        self._hear_processes()
-        for process, error in self.roster.settle(time.monotonic(), self.lost) if self.roster.closed else ():
-            self._refuse(process, error)
-
-    def _idle(self) -> None:
-        awaited = self.answers.silent if self.roster.closed else self.roster.missing
-        self._observers.idle(ChannelStatus(self.slot, self.dropped(), awaited))
+            awaited = self.answers.silent if self.roster.closed else self.roster.missing
+            self._observers.idle(ChannelStatus(self.slot, self.dropped(), awaited))
 
     def _goes_on(self, slot: int, answers: Answers) -> bool:
-        """All agents have answered a slot; whether the run goes on."""
+        """All agents have answered a slot; return whether the run goes on."""
         self._observers.all_answered(slot, answers)
         return not self._referee.over(slot, answers)
 
-    def _tell_time(self, stamp: Time) -> None:
+    def _publish_clock(self, time_ns: int) -> None:
         if self._clock_watched:
-            self._clock.publish(Clock(clock=stamp))
+            self._clock.publish(Clock(clock=time_of(time_ns)))
 
     def _publish_end(self) -> None:
-        """Tells all nodes that the run is over."""
+        """Tell all nodes that the run is over."""
         if self.node.context.ok():
             proof = array("B", self._identity.proof)
             self._publisher.publish(Slot(run=self.run_id, slot=max(0, self.slot + 1), phase=Slot.END, data=proof))
@@ -267,37 +299,26 @@ class RosChannel:
         self._end_s = min(self._end_s, _HURRY_S)
 
     def close(self) -> None:
-        """Closes the observers first, waits until all nodes know that the run is over or have left, frees the handles.
+        """Close the observers first, wait until all nodes know that the run is over or have left, free the handles.
 
         :raises DtsaError: when an observer could not be closed.
         """
         try:
             self._observers.ended(self.slot, self._reason or "ended early", self._failed)
         finally:
-            self._close()
+            try:
+                self._observers.close()
+            finally:
+                self._await_end()
+                self._processes.close()
+                self.loop.close()
 
-    def _close(self) -> None:
-        try:
-            self._observers.close()
-        finally:
-            self._wait_until_told()
-            self._processes.close()
-            self.loop.close()
-
-    def _wait_until_told(self) -> None:
-        """Waits until all nodes know that the run is over, or have left."""
+    def _await_end(self) -> None:
+        """Wait until all nodes know that the run is over, or have left."""
         deadline = time.monotonic() + self._end_s
         while self.node.context.ok() and time.monotonic() < deadline:
-            # The middleware asks for acknowledgements, and repeats what was lost, every 3 s only: so say it again.
-            if self._publisher.wait_for_all_acked(Duration(seconds=_REPEAT_S)):
+            # The middleware asks for acknowledgements, and repeats what was lost, every 3 s only: so publish it again.
+            if self._publisher.wait_for_all_acked(Duration(seconds=REPEAT_S)):
                 break
             self._publish_end()
         self._hear_processes()  # they end with their last counts
-
-
-def put_frames(message: Slot, senders: list[int], frames: list[bytes], received: Any) -> None:
-    """Puts frames that somebody received into a slot message."""
-    message.sender = array("H", senders)
-    message.length = array("B", [len(frame) for frame in frames])
-    message.data = array("B", b"".join(frames))
-    message.received = array("B", pack_received(received))

@@ -1,35 +1,43 @@
-"""The processes of a run: who they are, what they fly with, and what they have not taken in."""
+"""Who takes part in a run: its processes before slot 0, and which agents are heard, lost and back in real time."""
 
 from __future__ import annotations
 
+import math
+import time
 from array import array
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtsa_msgs.msg import Process
+import numpy as np
+from dtsa_msgs.msg import Process, Slot
+from numpy.typing import NDArray
+from rclpy.publisher import Publisher
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import settings_hash
+from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
+from dtsa_agent.ros.common.process.loop import Feed
 from dtsa_agent.ros.common.process.runs import run_text
-from dtsa_agent.ros.common.wire.checks import (
-    OTHER_RUN,
-    OTHER_SENDER,
-    RANGE,
-    UNKNOWN,
-    OnePublisher,
-    Unusable,
-    check_process,
-    parse_json,
-    plain,
-)
-from dtsa_agent.ros.common.wire.intake import add_counts
+from dtsa_agent.ros.common.wire import checks
+from dtsa_agent.ros.common.wire.checks import OnePublisher, Unusable
+from dtsa_agent.ros.common.wire.messages import Fields, read_report
+
+from .answers import Accounts, Answers
 
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s
 _LEFT_OVER_S = 3.0  # agents whose channel has gone end within this time
 _MOST_STRANGERS = 256
+LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
+_RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
+_ROUNDS, _LONGEST_S = 20, 0.5  # of one measurement
+_SHORTER = 0.8  # rounds that take so much of what those before took become shorter
+_SETTLED_S = 10.0  # after that a measurement counts however long rounds take
+_PAUSE_S = 0.0001
+_BURST = 256  # messages; whatever comes, the clock is looked at
 
 
 @dataclass(slots=True)
@@ -43,30 +51,29 @@ class Member:
     sender: bytes | None  # participant of all its messages; None: not known
     dropped: dict[str, int] = field(default_factory=dict)
     publisher: OnePublisher = field(init=False)
-    frames: OnePublisher = field(init=False)  # likewise of frames, in real time
 
     def __post_init__(self) -> None:
-        self.publisher, self.frames = OnePublisher(self.sender), OnePublisher(self.sender)
+        self.publisher = OnePublisher(self.sender)
 
 
 class Roster:
     """Collects what the processes say about themselves before slot 0, and keeps out those that do not fit.
 
-    All must share the settings ``agreed``. Times are s, monotonic; ``sender`` is who sent a message, None: not known;
-    ``number`` is the message's number, as its publisher counts; ``absent`` are ids of agents that nobody waits for.
+    All must share the settings ``agreed``. Times are s, monotonic; ``sender`` is the sender of a message, None: not
+    known; ``absent`` are ids of agents that are not waited for.
     """
 
     def __init__(self, agents: int, run: int, agreed: Mapping[str, Any], channel: str) -> None:
         self._agents, self._run = agents, run
         self._agreed = dict(agreed)
-        self._agreed_by = dict.fromkeys(agreed, channel)  # who has said so, by setting
+        self._agreed_by = dict.fromkeys(agreed, channel)  # node that has said so, by setting
         self._members: dict[int, Member] = {}  # by process
         self._of: dict[int, Member] = {}  # by agent
         self._groups: dict[bytes, Member] = {}  # by the ids of all agents of a process, as messages carry them
         self._rivals: dict[int, tuple[Member, float]] = {}  # processes that claim agents of a member, since when
         self._left_over: dict[int, float] = {}  # processes of another run, since when
         self._gone: dict[str, int] = {}  # what processes that have been replaced had dropped
-        self.closed = False
+        self.closed = False  # slot 0 begins: from now on no settings end the run
 
     @property
     def missing(self) -> list[int]:
@@ -95,31 +102,28 @@ class Roster:
                 self._replace(rival)
         return refused
 
-    def close(self) -> None:
-        """Slot 0 begins: from now on nobody's settings end the run."""
-        self.closed = True
-
-    def hear(self, message: Process, now_s: float, sender: bytes | None = None) -> None:
-        """Takes in what a process says about itself.
+    def hear(self, message: Process, now_s: float, sender: bytes | None) -> None:
+        """Process what a process says about itself.
 
         :raises ConfigError: if it cannot take part, naming setting, both values and node.
         :raises Unusable: for a message that cannot be, or of another run.
         """
-        check_process(message, self._agents)
-        message.node = plain(message.node)
+        checks.check_process(message, self._agents)
+        message.node = checks.plain(message.node)
         if message.run != self._run:
             self._hear_other(message, now_s)
-            raise Unusable(OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
-        member = self._members.get(message.process)
-        if member is None:
-            member = self._meet(message, now_s, sender)
+            raise Unusable(checks.OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
+        member = self._members.get(message.process) or self._meet(message, now_s, sender)
         if member.sender != sender:
-            raise Unusable(OTHER_SENDER, f"a message about {message.node} that is not its own")
+            raise Unusable(checks.OTHER_SENDER, f"a message about {message.node} that is not its own")
         if member.ids != tuple(message.agent):
-            raise Unusable(UNKNOWN, f"{message.node} for other agents than before")
+            raise Unusable(checks.UNKNOWN, f"{message.node} for other agents than before")
         member.heard_s = now_s
         member.dropped = dict(zip(message.dropped_reason, message.dropped, strict=True))
-        self._check_rivals(member)
+        for rival, since_s in () if self.closed else self._rivals.values():
+            taken = set(rival.ids) & set(member.ids)
+            if rival is not member and taken and member.heard_s > since_s:
+                raise self._conflict(rival, taken)  # both are alive
 
     def _meet(self, message: Process, now_s: float, sender: bytes | None) -> Member:
         """A process tells about itself for the first time."""
@@ -130,7 +134,7 @@ class Roster:
         self._compare(message)
         if any(agent in self._of for agent in member.ids):
             if len(self._rivals) >= _MOST_STRANGERS:
-                raise Unusable(UNKNOWN, "too many processes for the same agents")
+                raise Unusable(checks.UNKNOWN, "too many processes for the same agents")
             self._rivals[member.process] = (member, now_s)
         else:
             self._replace(member)
@@ -141,23 +145,13 @@ class Roster:
         for agent in member.ids:
             before = self._of.get(agent)
             if before is not None and self._members.pop(before.process, None):
-                add_counts(self._gone, before.dropped)
+                checks.add_counts(self._gone, before.dropped)
                 del self._groups[_key(before.ids)]
                 for other in before.ids:
                     self._of.pop(other, None)
         self._members[member.process] = self._groups[_key(member.ids)] = member
         for agent in member.ids:
             self._of[agent] = member
-
-    def _check_rivals(self, member: Member) -> None:
-        """Whether a member tells about itself after another process has claimed its agents.
-
-        :raises ConfigError: then both are alive.
-        """
-        for rival, since_s in self._rivals.values():
-            taken = set(rival.ids) & set(member.ids)
-            if rival is not member and taken and member.heard_s > since_s and not self.closed:
-                raise self._conflict(rival, taken)
 
     def _conflict(self, rival: Member, taken: Set[int]) -> ConfigError:
         nodes = ", ".join(sorted({self._of[agent].node for agent in taken}))
@@ -166,24 +160,21 @@ class Roster:
         )
 
     def _compare(self, message: Process) -> None:
-        """Compares a process's settings with those that all share.
+        """Compare a process's settings with those that all share.
 
         :raises ConfigError: if they differ.
         :raises Unusable: if they are none.
         """
         try:
-            given = parse_json(message.settings)
+            given = checks.parse_json(message.settings)
         except ValueError:
             given = None
         if not isinstance(given, dict) or settings_hash(given) != message.settings_hash:
-            raise Unusable(RANGE, f"{message.node} says nothing about its settings")
+            raise Unusable(checks.RANGE, f"{message.node} says nothing about its settings")
         for name in sorted(self._agreed):
             if name not in given or given[name] != self._agreed[name]:
-                raise ConfigError(
-                    f"{name} of {message.node}",
-                    given.get(name),
-                    f"{self._agreed[name]!r}, as {self._agreed_by[name]} has it",
-                )
+                allowed = f"{self._agreed[name]!r}, as {self._agreed_by[name]} has it"
+                raise ConfigError(f"{name} of {message.node}", given.get(name), allowed)
         further = sorted(set(given) - set(self._agreed))
         if further:  # a channel without agents' settings of its own: those of the first process count
             self._agreed.update((name, given[name]) for name in further)
@@ -198,41 +189,159 @@ class Roster:
             return
         since_s = self._left_over.setdefault(message.process, now_s)
         if now_s - since_s > _LEFT_OVER_S:
-            raise ConfigError(
-                f"run of {message.node}",
-                run_text(message.run),
-                f"no process of another run on these topics; it has {named(message.agent)}",
-            )
+            allowed = f"no process of another run on these topics; it has {named(message.agent)}"
+            raise ConfigError(f"run of {message.node}", run_text(message.run), allowed)
 
-    def check_sender(self, ids: Any, number: int | None, now_s: float, sender: bytes | None = None) -> None:
-        """Whether a message can be from the process that has some agents.
-
-        :raises Unusable: if it cannot.
-        """
+    def check_sender(self, ids: Any, now_s: float, sender: bytes | None) -> None:
+        """Check that a message can be from the process that has some agents."""
         member = self._groups.get(ids.tobytes())
         if member is None:
-            raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
-        if not member.publisher.admits(number, now_s, sender):
-            raise Unusable(OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}")
+            raise Unusable(checks.UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
+        if not member.publisher.admits(now_s, sender):
+            raise Unusable(checks.OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}")
 
-    def check_frame(self, agent: int, number: int | None, now_s: float, sender: bytes | None = None) -> None:
-        """Whether a frame can be from the process that has its sender.
-
-        :raises Unusable: if it cannot.
-        """
+    def check_frame(self, agent: int, now_s: float, sender: bytes | None) -> None:
+        """Check that a frame can be from the process that has its sender."""
         member = self._of.get(agent)
         if member is None:
-            raise Unusable(UNKNOWN, f"a frame of cf{agent}, which no process has")
-        if not member.frames.admits(number, now_s, sender):
-            raise Unusable(OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
+            raise Unusable(checks.UNKNOWN, f"a frame of cf{agent}, which no process has")
+        if not member.publisher.admits(now_s, sender):
+            raise Unusable(checks.OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
 
     def dropped(self) -> dict[str, int]:
-        """What all processes have not taken in, by reason."""
+        """Return the number of messages that all processes have dropped, by reason."""
         total = dict(self._gone)
         for member in self._members.values():
-            add_counts(total, member.dropped)
+            checks.add_counts(total, member.dropped)
         return total
 
 
 def _key(ids: tuple[int, ...]) -> bytes:
     return array("H", ids).tobytes()
+
+
+class Attendance:
+    """Keeps the ids of lost agents in ``lost``, in real time. Times are ns from the start of slot 0; agents are ids."""
+
+    def __init__(self, agents: int, lost: set[int]) -> None:
+        self._lost = lost
+        self.returned: set[int] = set()  # ids of those that were lost, and report again
+        self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
+        self._heard_ns = np.zeros(agents, dtype=np.int64)  # when each was heard last
+
+    def begin(self) -> None:
+        """Slot 0 is near: no agent has been heard yet."""
+        self._heard_ns[:] = 0
+
+    def lose(self, agent: int, slot: int) -> bool:
+        """Note in the present slot that an agent is gone; return whether that is new."""
+        if agent in self._lost:
+            return False
+        self._lost.add(agent)
+        self.returned.discard(agent)
+        self._given_up[agent] = slot
+        return True
+
+    def expect_later(self, agent: int) -> None:
+        """Note that a lost agent may come from slot 0 on."""
+        self._given_up[agent] = -_RETURN_SLOTS
+
+    def hear(self, agents: Iterable[int], now: int) -> None:
+        """Agents were heard."""
+        index = np.fromiter(agents, dtype=np.intp) - 1
+        self._heard_ns[index] = np.maximum(self._heard_ns[index], now)
+
+    def excuse(self, stalled_ns: int, until_ns: int) -> None:
+        """The channel has stood still: silence until then counts for no agent."""
+        self._heard_ns[:] = np.maximum(self._heard_ns + stalled_ns, until_ns)
+
+    def back(self, slot: int, answered: NDArray[np.bool_]) -> list[int]:
+        """Return the lost agents that have reported for a slot; they are not lost any more."""
+        again = [a for a in sorted(self._lost) if answered[a - 1] and slot > self._given_up[a] + _RETURN_SLOTS]
+        self._lost.difference_update(again)
+        self.returned.update(again)
+        return again
+
+    def silent_too_long(self, agents: Iterable[int]) -> list[int]:
+        """Return which of some agents are to be taken for lost.
+
+        They are compared with the others: if none is heard, it may be the channel that got no time.
+        """
+        newest = int(self._heard_ns.max())
+        return [agent for agent in agents if newest - self._heard_ns[agent - 1] > LOST_AFTER_S * 1e9]
+
+
+class RollCall:
+    """Calls all agents before slot 0 in real time, by number, and measures how long messages take on this machine.
+
+    ``accounts`` get the answers, ``calling`` is the call as slot messages carry it.
+    """
+
+    def __init__(
+        self, publisher: Publisher, reports: Feed, run_id: int, calling: array[int], accounts: Accounts
+    ) -> None:
+        self._publisher, self._reports, self._run_id, self._calling = publisher, reports, run_id, calling
+        self._accounts = accounts
+        self._number = names.FIRST_CALL
+
+    def call(self) -> None:
+        """Call, with the same number until a round is measured."""
+        data = self._calling
+        self._publisher.publish(Slot(run=self._run_id, phase=Slot.PREPARE, slot=self._number, data=data))
+
+    def present(self) -> set[int]:
+        """Return the agents that have answered the first call since this was asked."""
+        present: set[int] = set()
+        for message in self._answers():
+            with suppress(Unusable):
+                self._accounts.add(message, self._number)
+                present.update(message.agent)
+        return present
+
+    @property
+    def answers(self) -> Answers:
+        """What all have answered to the first call: where they are, above all."""
+        return self._accounts[names.FIRST_CALL]
+
+    def _answers(self) -> Iterator[Fields]:
+        """Give answers to the last call that have come in, some at a time."""
+        for _ in range(_BURST):
+            data = self._reports.take()
+            if data is None:
+                return
+            try:
+                message = read_report(data)
+            except Exception:  # rclpy has no common base for what a message can do to it
+                continue
+            if message.run == self._run_id and message.slot.tolist() == [self._number]:
+                yield message
+
+    def round_ms(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
+        """Return how long a round of messages takes, from a call to the last answer: ms, median over some rounds.
+
+        Many processes may have found the channel and still look for each other. So a measurement is repeated for some
+        seconds while only some answer in time, or rounds that take too long become shorter.
+        """
+        end, before = time.monotonic() + _SETTLED_S, math.inf
+        while True:
+            took, silent = self._series(agents)
+            settled = silent == agents or (not silent and (took <= enough_ms or took > _SHORTER * before))
+            if settled or time.monotonic() > end or give_up():
+                return took
+            before = math.inf if silent else took
+
+    def _series(self, agents: set[int]) -> tuple[float, set[int]]:
+        """Return the median of some rounds, ms, and the agents that did not answer in time in the last of them."""
+        end, rounds = time.monotonic() + _LONGEST_S, []
+        for _ in range(_ROUNDS):
+            begin, awaited = time.monotonic(), set(agents)
+            self._number += 1
+            self.call()
+            while awaited and time.monotonic() < end:
+                time.sleep(_PAUSE_S)
+                for message in self._answers():
+                    awaited.difference_update(message.agent)
+            rounds.append(time.monotonic() - begin)
+            if time.monotonic() >= end:
+                break
+        return float(np.median(rounds)) * 1e3, awaited

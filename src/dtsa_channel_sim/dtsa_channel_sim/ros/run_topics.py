@@ -1,10 +1,11 @@
-"""What the channel's node tells about a run: settings and status, diagnostics, transforms, lines of its log."""
+"""What the channel's node publishes about a run: settings and status, diagnostics, transforms, lines of its log."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -16,7 +17,7 @@ from std_msgs.msg import Header
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.waiting import Waiting
-from dtsa_agent.ros.common.wire.stamps import header_of, time_of
+from dtsa_agent.ros.common.wire.messages import header_of, time_of
 from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
 
@@ -39,18 +40,18 @@ def configuration_message(settings: Mapping[str, Any], run_id: int) -> Configura
     )
 
 
+@dataclass(slots=True)
 class RunState:
-    """Content of a status message, kept up to date by an observer of the channel."""
+    """Content of a status message."""
 
-    def __init__(self, run_id: int, slot_ns: int) -> None:
-        self.phase: int = RunStatus.WAITING
-        self.slot = 0
-        self.awaited: list[int] = []
-        self.lag_ms = 0.0
-        self.reason = ""
-        self._run_id, self._slot_ns = run_id, slot_ns
-        self._lost: set[int] = set()
-        self._returned: set[int] = set()
+    run_id: int
+    slot_ns: int
+    phase: int = RunStatus.WAITING
+    slot: int = 0
+    awaited: list[int] = field(default_factory=list)
+    reason: str = ""
+    _lost: set[int] = field(default_factory=set)
+    _returned: set[int] = field(default_factory=set)
 
     def lose(self, agent: int) -> None:
         """Note that an agent has fallen silent."""
@@ -65,14 +66,13 @@ class RunState:
     def message(self) -> RunStatus:
         """Return a dtsa_msgs/RunStatus."""
         return RunStatus(
-            header=header_of(names.slot_time_ns(self.slot, self._slot_ns)),
-            run=self._run_id,
+            header=header_of(names.slot_time_ns(self.slot, self.slot_ns)),
+            run=self.run_id,
             phase=self.phase,
             slot=self.slot,
             awaited=self.awaited if self.phase == RunStatus.WAITING else [],
             lost=sorted(self._lost),
             returned=sorted(self._returned),
-            lag_ms=self.lag_ms,
             reason=self.reason,
         )
 
@@ -110,9 +110,9 @@ class RunTopics(ChannelObserver):
 
     def idle(self, status: ChannelStatus) -> None:
         state = self._state
-        awaited = status.awaited != state.awaited and state.phase == RunStatus.WAITING
-        state.slot, state.awaited, state.lag_ms = max(0, status.slot), status.awaited, status.lag_ms
-        if awaited or time.monotonic() >= self._next_s:
+        changed = status.awaited != state.awaited and state.phase == RunStatus.WAITING
+        state.slot, state.awaited = max(0, status.slot), status.awaited
+        if changed or time.monotonic() >= self._next_s:
             self._publish()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
@@ -144,7 +144,7 @@ class Diagnostics(ChannelObserver):
             **{f"not taken in: {reason}": count for reason, count in sorted(status.dropped.items())},
             **{f"slots: {name}": count for name, count in zip(OUTCOMES, self._counts, strict=True)},
         }
-        told = DiagnosticStatus(
+        message = DiagnosticStatus(
             level=DiagnosticStatus.WARN if status.dropped else DiagnosticStatus.OK,
             name=self._name,
             message=f"slot {status.slot}",
@@ -152,7 +152,7 @@ class Diagnostics(ChannelObserver):
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
         stamp = time_of(names.slot_time_ns(max(0, status.slot), self._slot_ns))
-        self._publisher.publish(DiagnosticArray(header=Header(stamp=stamp), status=[told]))
+        self._publisher.publish(DiagnosticArray(header=Header(stamp=stamp), status=[message]))
 
 
 class Transforms(ChannelObserver):
@@ -195,7 +195,7 @@ class Transforms(ChannelObserver):
 
 
 class RunLog(ChannelObserver):
-    """Logs whom the channel waits for, when slot 0 starts, which agents are lost or back, and why the run ends."""
+    """Logs which agents are waited for, when slot 0 starts, which are lost or back, and why the run ends."""
 
     def __init__(self, node: Node, run_id: int, lockstep: bool) -> None:
         self._logger = node.get_logger()
@@ -239,7 +239,4 @@ class RunLog(ChannelObserver):
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
         text = f"the run ends after slot {slot}: {reason}" if self._flying else f"no slot was flown: {reason}"
-        if failed:
-            self._logger.error(text)
-        else:
-            self._logger.info(text)
+        (self._logger.error if failed else self._logger.info)(text)

@@ -43,7 +43,6 @@ class DongleError(DeviceError):
 class Dongle:
     """A dongle that hears all broadcasts between Crazyflies on its channel, and sends some.
 
-    :param settings: which one, and to what it is tuned.
     :raises ConfigError: if it cannot be used.
     """
 
@@ -92,7 +91,6 @@ class Dongle:
     def write(self, transfer: bytes) -> None:
         """Sends a packet; when it leaves, nobody knows.
 
-        :param transfer: address and payload.
         :raises DongleError: if the dongle does not take it.
         """
         try:

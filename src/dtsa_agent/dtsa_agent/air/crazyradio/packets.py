@@ -45,10 +45,7 @@ class PacketReader:
         self.garbled = 0  # transfers, or ends of these, that are no packets
 
     def feed(self, data: bytes) -> list[Packet]:
-        """The packets that are whole now.
-
-        :param data: what one read has given; empty: nothing came for a while.
-        """
+        """The packets that are whole with what one read has given; empty: nothing came for a while."""
         if not data:
             self.garbled += bool(self._rest)
             self._rest = b""
@@ -73,20 +70,12 @@ class PacketReader:
 
 
 def broadcast(data: bytes, port: int) -> bytes:
-    """The transfer that sends a datagram to all Crazyflies and their like.
-
-    :param data: the datagram, at most 60 bytes.
-    :param port: of peer-to-peer communication, 0 to 15.
-    """
+    """The transfer that sends a datagram of at most 60 bytes to all Crazyflies and their like, on a port of 0 to 15."""
     return BROADCAST + bytes((_PEER, _PORT | port)) + data
 
 
 def datagram_in(payload: bytes, port: int) -> bytes | None:
-    """The datagram in a packet; None: it is not a broadcast between Crazyflies on this port.
-
-    :param payload: of the packet.
-    :param port: of peer-to-peer communication, 0 to 15.
-    """
+    """The datagram in a packet; None: it is not a broadcast between Crazyflies on this port."""
     if len(payload) < 2 or payload[0] & _PEER_BITS != _PEER_BITS or payload[1] != _PORT | port:
         return None
     return payload[2:]

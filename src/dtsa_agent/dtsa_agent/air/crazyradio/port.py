@@ -19,7 +19,6 @@ _PRIORITY = 20
 class CrazyradioPort(DevicePort[Dongle]):
     """See the module, and :class:`~dtsa_agent.air.device_port.DevicePort`.
 
-    :param settings: which dongle, and to what it is tuned.
     :raises ConfigError: if it cannot be used.
     """
 

@@ -32,11 +32,7 @@ class DongleClock:
         self.strange = 0  # stamps that could not be used
 
     def arrival_ns(self, stamp_us: int, read_ns: int) -> int:
-        """When a packet was whole, CLOCK_MONOTONIC; when it was read, if its stamp tells nothing.
-
-        :param stamp_us: of the dongle.
-        :param read_ns: ns, when the packet was read, CLOCK_MONOTONIC.
-        """
+        """When a packet was whole, CLOCK_MONOTONIC, ns; when it was read (ns), if its stamp tells nothing."""
         if self._ahead_ns is None:
             self._set(read_ns - stamp_us * _US, read_ns)
             return read_ns

@@ -31,8 +31,6 @@ _REASONS = {
 class Device:
     """An open serial device.
 
-    :param path: of the device.
-    :param baud: bit/s.
     :raises ConfigError: if it cannot be used.
     """
 
@@ -64,7 +62,6 @@ class Device:
     def read(self, patience_s: float) -> bytes:
         """What has come; empty if nothing comes for a while.
 
-        :param patience_s: s, how long to wait.
         :raises DeviceError: if the device has gone.
         """
         try:
@@ -83,7 +80,6 @@ class Device:
     def write(self, data: bytes) -> None:
         """Gives the device bytes, all or none of them, without waiting.
 
-        :param data: the bytes of one frame.
         :raises DeviceError: if it does not take them now.
         """
         try:

@@ -25,10 +25,7 @@ _MOST = LONGEST + _CRC + 1  # bytes between zeros
 
 
 def to_line(datagram: bytes) -> bytes:
-    """The bytes of a datagram on the line.
-
-    :param datagram: at most ``LONGEST`` bytes.
-    """
+    """The bytes of a datagram of at most ``LONGEST`` bytes on the line."""
     zero = b"\0"
     return zero + cobs.encode(datagram + crc_hqx(datagram, 0xFFFF).to_bytes(_CRC, "little")) + zero
 
@@ -43,10 +40,7 @@ class LineReader:
         self.garbled_bytes = 0
 
     def feed(self, chunk: bytes) -> Iterator[tuple[bytes, int]]:
-        """Yields the datagrams that end in a piece of what comes, and how many bytes of the piece follow each.
-
-        :param chunk: the piece.
-        """
+        """Yields the datagrams that end in a piece of what comes, and how many bytes of the piece follow each."""
         at = 0
         while (end := chunk.find(0, at)) >= 0:
             self._take(chunk[at:end])

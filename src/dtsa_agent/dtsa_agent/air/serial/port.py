@@ -21,7 +21,6 @@ _LATENCY_MS = 2  # an adapter may keep bytes for so long
 class SerialPort(DevicePort[Device]):
     """See the module, and :class:`~dtsa_agent.air.device_port.DevicePort`.
 
-    :param settings: which device, its speed and its modem.
     :raises ConfigError: if it cannot be used.
     """
 

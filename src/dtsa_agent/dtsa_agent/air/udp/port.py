@@ -38,7 +38,6 @@ class UdpPort:
     agents on this computer hear it in the same way. When the interface is made anew, or gets another address, the group
     is joined again: at a send that the network refuses, and for those that only listen within a second.
 
-    :param settings: interface and group.
     :raises ConfigError: if the interface cannot be used.
     """
 
@@ -119,10 +118,7 @@ class UdpPort:
         return self._in.fileno()
 
     def send(self, data: bytes) -> str:
-        """Sends to the group at once; why the network has not taken it, or an empty text.
-
-        :param data: the datagram.
-        """
+        """Sends to the group at once; why the network has not taken it, or an empty text."""
         refusal = self._send(data)
         return self._send(data) if refusal and self.look() else refusal
 
@@ -134,10 +130,7 @@ class UdpPort:
         return ""
 
     def receive(self, most: int) -> list[ReceivedDatagram]:
-        """What has arrived, in this order; empty if nothing has.
-
-        :param most: number of datagrams at a time.
-        """
+        """What has arrived, in this order; empty if nothing has."""
         self._look_in_time()
         count = lib.socket_read(self._reader, most)
         return [
@@ -185,7 +178,6 @@ def _place(settings: UdpSettings) -> Place:
 def interface_address(name: str) -> str:
     """The IPv4 address of a network interface.
 
-    :param name: of the interface.
     :raises ConfigError: if it has none.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:

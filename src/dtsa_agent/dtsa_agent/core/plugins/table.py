@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.swarm import Swarm
@@ -16,6 +18,7 @@ class Table:
     """
 
     def __init__(self, swarm: Swarm, row: int) -> None:
+        self._swarm, self._row = weakref.proxy(swarm), row  # a swarm has its tables: no cycle
         self.agent = int(swarm.observer[row]) + 1  # id of the observer, 0: one that hears everything
         self.config = swarm.config
         self.scenario = swarm.scenario
@@ -31,6 +34,14 @@ class Table:
         self.own_position = _window(swarm.position[:, row]) if here else None  # (3,) own true state
         self.own_velocity = _window(swarm.velocity[:, row]) if here else None
         self.goal = _window(swarm.goal[:, row]) if here else None
+
+    def observation(self, slot: int) -> NDArray[np.float32]:
+        """What the agent has heard before a slot and its own state, as numbers for learning (docs/how-to/learning.md).
+
+        :raises ValueError: for the table of an agent that is elsewhere.
+        """
+        observed: NDArray[np.float32] = self._swarm.observations(slot, self._row, self._row + 1)[0]
+        return observed
 
 
 def _window(array: NDArray[Any]) -> NDArray[Any]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.kernel import ffi, lib, memory
 
 from .config import SwarmConfig
 from .flight_models import flight_model
@@ -25,6 +27,7 @@ def generator(seed: int, stream: int, *more: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream, *more])))
 
 
+@lru_cache(maxsize=64)  # a sweep flies the same seeds again with other settings
 def policy_key(seed: int) -> int:
     """By which policies draw lots, 63 bits."""
     return int(generator(seed, STREAM_POLICY).integers(0, 2**63))
@@ -66,21 +69,25 @@ class Course:
     """
 
     def __init__(self, plan: Plan, local: NDArray[np.int32]) -> None:
-        self._start = plan.start[:, local]
-        self._goals = plan.goals[:, :, local]
-        self._begin, self._pause = plan.begin[local], plan.pause[local]
-        self._moving = plan.moving[local]
-        self._r_min = plan.r_min
-        self._columns = np.arange(len(local))
+        self._start, self._moving, self._legs = plan.start[:, local], plan.moving[local], len(plan.goals)
         self.leg = np.full(len(local), -1, dtype=np.int64)  # index of the present goal, -1: waits for its first slot
-        self._since = np.full(len(local), -1, dtype=np.int64)  # slot of arrival at the present goal, -1: under way
-        self.goal: Array = self._start.copy()  # (3, L) m, frame map, where each flies to now
-        self.changed = np.full(len(local), -1, dtype=np.int64)  # slot in which that became its goal
+        self._since = self.leg.copy()  # slot of arrival at the present goal, -1: under way
+        self.changed = self.leg.copy()  # slot in which that became its goal
+        self.goal: Array = np.ascontiguousarray(self._start)  # (3, L) m, frame map, where each flies to now
+        arrays = {
+            "local": np.array(local, dtype=np.int32), "start": np.ascontiguousarray(plan.start),
+            "goals": np.ascontiguousarray(plan.goals), "begin": np.array(plan.begin, dtype=np.int64),
+            "pause": np.array(plan.pause, dtype=np.int64), "moving": np.array(plan.moving, dtype=np.uint8),
+            "leg": self.leg, "since": self._since, "changed": self.changed, "goal": self.goal,
+        }  # fmt: skip
+        self._lent = {name: memory(array) for name, array in arrays.items()}
+        sizes = {"n": plan.start.shape[1], "count": len(local), "goal_count": self._legs, "r_min": plan.r_min}
+        self.kernel = ffi.new("course *", {**sizes, **self._lent})
 
     def reset(self) -> None:
         """Back to the start of the flight."""
         self.leg[:] = self._since[:] = self.changed[:] = -1
-        self.goal = self._start.copy()
+        self.goal[:] = self._start
 
     @property
     def active(self) -> NDArray[np.bool_]:
@@ -90,25 +97,13 @@ class Course:
     @property
     def final(self) -> NDArray[np.bool_]:
         """The agents that have no further goal after the present one, (L,)."""
-        return np.asarray(~self._moving | (self.leg == len(self._goals) - 1))
+        return np.asarray(~self._moving | (self.leg == self._legs - 1))
 
     def advance(self, slot: int, position: Array) -> bool:
         """Takes note of where the agents are, (3, L) m, when a slot begins; returns whether any goal has changed."""
-        onward = (self.leg < 0) & (self._begin <= slot)
-        if len(self._goals) > 1:
-            offset = position - self.goal
-            under_way = (self.leg >= 0) & (self.leg < len(self._goals) - 1)
-            arrived = under_way & (np.sqrt((offset * offset).sum(axis=0)) <= self._r_min)
-            self._since[arrived & (self._since < 0)] = slot
-            onward |= under_way & (self._since >= 0) & (slot - self._since >= self._pause)
-        if not onward.any():
-            return False
-        self.leg[onward] += 1
-        self._since[onward] = -1
-        self.changed[onward] = slot
-        chosen = self._goals[np.maximum(self.leg, 0), :, self._columns].T
-        self.goal = np.where(self.leg >= 0, chosen, self._start)
-        return True
+        if position.shape != self.goal.shape:
+            raise ValueError(f"position: shape {position.shape}")
+        return bool(lib.course_advance(self.kernel, slot, memory(np.ascontiguousarray(position, dtype=np.float64))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,22 +130,10 @@ class Scenario:
 
         Only the own state of each agent is looked at.
         """
-        course = swarm.course
-        if course is None or self.plan is None:
-            if slot == 0:
-                swarm.active[:] = self.moving[swarm.local]
-            return
-        if course.advance(slot, swarm.position) or slot == 0:
-            swarm.goal[:] = course.goal
-            swarm.final[:] = course.final
-        if self.goals_known:
-            # An agent that waits for its first slot stands at its start, and all know that.
-            swarm.known_goal[:] = np.where(self.plan.begin <= slot, self.target, self.start)
-        swarm.active[:] = course.active
-        if swarm.config.announce:
-            # Nobody knows that an agent is about to leave before it has said so: it hovers until then.
-            own = swarm.sent_slot[0 if swarm.shared else swarm.rows, swarm.local]
-            swarm.active[(own < course.changed) & (own >= 0)] = 0
+        if swarm.course is not None:
+            lib.swarm_advance(swarm.kernel, swarm.course.kernel, slot)
+        elif slot == 0:
+            swarm.active[:] = self.moving[swarm.local]
 
 
 def make_scenario(config: SwarmConfig) -> Scenario:

@@ -18,7 +18,6 @@ import numpy as np
 from dtsa_msgs.msg import Slot, VelocityWorld
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty
@@ -28,16 +27,14 @@ from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.crazyflie.state.conversions import rotate
 from dtsa_agent.keys import authenticator
 from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
-from dtsa_agent.ros.common.graph.parameters import declare_settings
+from dtsa_agent.ros.common.graph.parameters import declare_settings, swarm_wide_node
 from dtsa_agent.ros.common.process.loop import Feed, Stop
 from dtsa_agent.ros.common.process.node_process import run_node
 from dtsa_agent.ros.common.process.priority import take_priority
 from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, OnePublisher, Unusable, check_odometry
-from dtsa_agent.ros.common.wire.slot_fields import SlotFields
-from dtsa_agent.ros.hosting import declare_swarm
+from dtsa_agent.ros.common.wire.messages import Fields
 from dtsa_agent.ros.realtime import RealtimeNode
-from dtsa_agent.ros.swarm_node import parse_ids
+from dtsa_agent.ros.swarm_host import declare_ids, declare_swarm
 
 from .external_vehicles import ExternalVehicles
 
@@ -96,7 +93,7 @@ class StationNode(RealtimeNode):
         :raises Unusable: if it cannot. Without any for a while the vehicle gets no commands, and the bridge holds it.
         """
         check_odometry(message)
-        if not self._bridges[index].admits(feed.number, time.monotonic(), feed.sender):
+        if not self._bridges[index].admits(time.monotonic(), feed.sender):
             raise Unusable(OTHER_SENDER, f"odometry of cf{self.ids[index]} from two publishers")
 
     def _note(self, index: int, message: Odometry) -> None:
@@ -114,7 +111,7 @@ class StationNode(RealtimeNode):
             message.vel.x, message.vel.y, message.vel.z = velocity[:, 0].tolist()
             self._outputs[index].publish(message)
 
-    def _prepare(self, message: SlotFields) -> bool:
+    def _prepare(self, message: Fields) -> bool:
         self._sense()
         if message.phase == Slot.PREPARE and self._blind:
             return True
@@ -140,14 +137,12 @@ def _body(stop: Stop, supervised: bool) -> None:
     node, space = swarm_wide_node("crazyflie_agents", plain)
     try:
         config = declare_swarm(node)
-        listed = ParameterDescriptor(description="ids of the agents in this process; [0]: all", read_only=True)
-        ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
+        ids = declare_ids(node, config.agents)
         station = StationNodeSettings(**declare_settings(node, StationNodeSettings))
         take_priority(station.priority)
-        ids = parse_ids(ids, config.agents)
-        zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
-        more = {"authenticator": authenticator(config), "offset_ns": zero, "drift_ppb": zero, "align": False}
-        agents = StationNode(node, config, ids, space, command_hz=station.command_hz, **more)
+        # One station, one clock: no offsets, and nothing to align.
+        more = {"authenticator": authenticator(config), "align": False, "command_hz": station.command_hz}
+        agents = StationNode(node, config, ids, space, **more)
         try:
             agents.run(stop)
         finally:
@@ -158,7 +153,7 @@ def _body(stop: Stop, supervised: bool) -> None:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the node."""
-    return run_node("crazyflie_agents", _body, args, real_time=True)
+    return run_node("crazyflie_agents", _body, args)
 
 
 if __name__ == "__main__":

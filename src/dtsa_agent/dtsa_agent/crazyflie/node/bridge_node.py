@@ -28,9 +28,9 @@ from dtsa_agent.crazyflie.safety.rules import SafetySettings
 from dtsa_agent.crazyflie.settings.config import SwarmSettings, load_swarm
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_agent.ros.common.graph.parameters import declare_settings
+from dtsa_agent.ros.common.process.loop import Serving
 from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
 from dtsa_agent.ros.common.process.priority import stay_on_one_processor, take_priority
-from dtsa_agent.ros.common.process.serving import Serving
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 
 from .bridge import Bridge
@@ -261,7 +261,7 @@ def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = r
     """Entry point of the executable `crazyflie_bridge`; `use` returns the exit code."""
     argv = list(sys.argv if args is None else args)
     follow_supervisor()
-    limit_to_machine(os.environ, shared_memory=False)
+    limit_to_machine(os.environ)
     try:
         init_ros(argv)
     except Exception as error:  # rclpy's errors for a wrong command line have no common base

@@ -21,7 +21,7 @@ from dtsa_agent.crazyflie.state.conversions import VehicleState, to_map
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_agent.crazyflie.vehicle.reports import Snapshot, snapshot
 from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
-from dtsa_agent.ros.common.wire.covariances import UNKNOWN, diagonal
+from dtsa_agent.ros.common.wire.packing import UNKNOWN, diagonal
 
 LATEST_ONLY = QoSProfile(depth=1)
 FRAME = "map"

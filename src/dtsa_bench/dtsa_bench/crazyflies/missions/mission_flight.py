@@ -185,7 +185,7 @@ def fly_crazyflies(
     with ros_domain(wanted, shared=shared) as domain, ExitStack() as shown:
         directory = new_directory(out)
         (directory / "log").mkdir()
-        environment = run_environment(domain, directory / "log", shared_memory=False)
+        environment = run_environment(domain, directory / "log")
         if page is not None:
             shown.enter_context(view_process(domain, environment, page))
         station, ended = _Station(settings, directory, environment, attach), StopToken(stop)

@@ -28,7 +28,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Feed
 from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.wire.intake import Intake
+from dtsa_agent.ros.common.wire.checks import Intake
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 
 from .follower import Follower
@@ -68,7 +68,7 @@ class GraphSource:
         self, history: RunHistory, domain: int | None = None, space: str = names.SWARM, control: bool = False
     ) -> None:
         self._history, self._space = history, space
-        limit_to_machine(os.environ, shared_memory=False)  # a process that is killed beside it does not block it
+        limit_to_machine(os.environ)
         self._context = Context()
         init_ros(None, self._context, domain)
         self._node = Node(

@@ -34,43 +34,27 @@ TIME_ZERO_NS = 1_000_000_000
 
 
 def agent_namespace(agent: int, swarm_namespace: str = SWARM) -> str:
-    """Namespace of one agent: ``/cf3``, or ``/north/cf3`` in a swarm that is not the default one.
-
-    :param agent: its id.
-    :param swarm_namespace: namespace of what the whole swarm shares.
-    """
+    """Return the namespace of one agent: ``/cf3``, or ``/north/cf3`` in a swarm that is not the default one."""
     return f"{swarm_prefix(swarm_namespace)}/cf{agent}"
 
 
 def swarm_prefix(swarm_namespace: str) -> str:
-    """What stands before the names of a swarm's agents: nothing for the default swarm, ``/north`` for ``/north``.
-
-    :param swarm_namespace: namespace of what the whole swarm shares.
-    """
+    """Return what stands before the names of a swarm's agents: nothing for the default swarm, else ``/north``."""
     return "" if swarm_namespace == SWARM else swarm_namespace.rstrip("/")
 
 
 def body_frame(agent_namespace: str) -> str:
-    """Frame of an agent's body, as ``cf3/base_link`` or ``north/cf3/base_link``.
-
-    :param agent_namespace: the agent's namespace.
-    """
+    """Return the frame of an agent's body, as ``cf3/base_link`` or ``north/cf3/base_link``."""
     return f"{agent_namespace.strip('/')}/base_link"
 
 
 def clock_topic(swarm_namespace: str) -> str:
-    """The topic of the simulated time: ``/clock``, or the swarm's own one beside other swarms.
-
-    :param swarm_namespace: namespace of what the whole swarm shares.
-    """
+    """Return the topic of the simulated time: ``/clock``, or the swarm's own one beside other swarms."""
     return f"{swarm_prefix(swarm_namespace)}/clock"
 
 
 def slot_time_ns(slot: int, slot_ns: int) -> int:
-    """Simulated time at which a slot starts, ns.
-
-    :param slot_ns: ns, length of a slot.
-    """
+    """Return the simulated time at which a slot of that length starts, ns."""
     return TIME_ZERO_NS + slot * slot_ns
 
 
@@ -84,23 +68,15 @@ def latched_qos() -> Any:
 def lockstep_qos(writers: int = 1) -> Any:
     """Nothing may be lost on the way; every node has one message under way at a time, or a repeated one.
 
-    :param writers: number of nodes that write to the topic: a reader's history is shared by all of them.
+    A reader's history is shared by all nodes that write to the topic.
     """
-    from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=4 * writers,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return QoSProfile(depth=4 * writers, reliability=ReliabilityPolicy.RELIABLE)  # keeps the last, volatile
 
 
 def named(ids: Iterable[int]) -> str:
-    """Agents as the user knows them: ``cf3``, or ``cf1 .. cf6`` for many in a row.
-
-    :param ids: ids of the agents.
-    """
+    """Return agents as the user knows them: ``cf3``, or ``cf1 .. cf6`` for many in a row."""
     listed = sorted(ids)
     parts, start = [], 0
     for end in range(1, len(listed) + 1):

@@ -1,9 +1,10 @@
-"""ROS parameters made from the settings classes: name, description, range and default stand there, once."""
+"""ROS parameters made from the settings classes, and the swarm that a node belongs to."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -11,22 +12,23 @@ from itertools import pairwise
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidNamespaceException, InvalidParameterTypeException
 from rclpy.node import Node
+from rclpy.validate_namespace import validate_namespace
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting, Settings, format_values, settings_of
 from dtsa_agent.yaml_file import read_yaml
 
+from . import names
+
 _UNBOUNDED = 2.0**62
 _NOTHING = -1  # stands for None in a parameter that may be left open
+_AGENT = re.compile(r"(?P<swarm>.*)/cf\d+")
 
 
 def descriptor(setting: Setting, read_only: bool) -> ParameterDescriptor:
-    """The description that ``ros2 param describe`` shows.
-
-    :param setting: the setting.
-    :param read_only: whether it is fixed once the node runs.
-    """
+    """Return the description that ``ros2 param describe`` shows; ``read_only``: fixed once the node runs."""
     result = ParameterDescriptor(description=setting.description, read_only=read_only)
     low = -_UNBOUNDED if setting.minimum is None else setting.minimum
     high = _UNBOUNDED if setting.maximum is None else setting.maximum
@@ -54,15 +56,12 @@ def declare_settings(
     defaults: Mapping[str, Any] | None = None,
     prefix: str = "",
 ) -> dict[str, Any]:
-    """Declares a parameter for every setting of a settings class and gives the values that the node was started with.
+    """Declare a parameter for every setting of a class; return the values that the node was started with, by name.
 
-    :param node: the node.
-    :param cls: the settings class.
     :param skip: fields that become no parameter.
     :param changeable: settings that say so may be changed while the node runs; all others are read-only.
     :param defaults: values that replace the settings' defaults.
     :param prefix: stands before the settings' names in the parameters'.
-    :returns: values by the settings' names, for the class's ``from_dict``.
     :raises ConfigError: for a value of the wrong type or out of range.
     """
     values: dict[str, Any] = {}
@@ -75,27 +74,29 @@ def declare_settings(
 
 
 def declare_setting(node: Node, setting: Setting, prefix: str = "", read_only: bool = True) -> Any:
-    """Declares one parameter and gives the value that the node was started with.
-
-    :param node: the node.
-    :param setting: name, default, description and range.
-    :param prefix: stands before the setting's name in the parameter's.
-    :param read_only: whether it is fixed once the node runs.
-    :raises ConfigError: for a value of the wrong type or out of range.
-    """
+    """Declare one parameter; as :func:`declare_settings`."""
     name = prefix + setting.name
     default = _NOTHING if setting.default is None else to_parameter(setting, setting.default)
     try:
         parameter = node.declare_parameter(name, default, descriptor(setting, read_only))
     except Exception as error:  # rclpy has no common base for wrong types and values out of range
         given = node._parameter_overrides.get(name)
-        value = given.value if given is not None else default
-        raise ConfigError(name, value, setting.allowed) from error
+        raise ConfigError(name, default if given is None else given.value, setting.allowed) from error
     return from_parameter(setting, parameter.value)
 
 
+def declare_list(node: Node, name: str, default: list[Any], description: str) -> list[Any]:
+    """Declare a parameter that is a list of numbers of its default's kind; return its value, or raise as above."""
+    kind = "whole numbers" if isinstance(default[0], int) else "numbers with a decimal point"
+    try:
+        info = ParameterDescriptor(description=description, read_only=True)
+        return list(node.declare_parameter(name, default, info).value)
+    except InvalidParameterTypeException:
+        raise ConfigError(name, node._parameter_overrides[name].value, f"a list of {kind}, as {default}") from None
+
+
 def check_parameters(node: Node) -> None:
-    """Checks that the node has all parameters that it was given; called when it has declared them.
+    """Check that the node has all parameters that it was given; called when it has declared them.
 
     One in a file may be meant for other nodes: it is only warned of, as is a file with nothing for this node.
 
@@ -122,7 +123,7 @@ def check_parameters(node: Node) -> None:
 
 
 def _sections(content: Any, place: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """The parts of a file of parameters, by the nodes that they are for."""
+    """Give the parts of a file of parameters, by the nodes that they are for."""
     for name, value in content.items() if isinstance(content, Mapping) else ():
         if name == "ros__parameters":
             yield place, value if isinstance(value, Mapping) else {}
@@ -131,7 +132,7 @@ def _sections(content: Any, place: str = "") -> Iterator[tuple[str, Mapping[str,
 
 
 def from_parameter(setting: Setting, value: Any) -> Any:
-    """The setting's value from that of its parameter.
+    """Return the setting's value from that of its parameter.
 
     :raises ConfigError: if it is none.
     """
@@ -147,24 +148,56 @@ def from_parameter(setting: Setting, value: Any) -> Any:
 
 
 def to_parameter(setting: Setting, value: Any) -> Any:
-    """The value of the parameter that stands for a setting's value; the inverse of :func:`from_parameter`.
-
-    :param setting: the setting.
-    :param value: its value.
-    """
+    """Return the value of the parameter that stands for a setting's value; the inverse of :func:`from_parameter`."""
     if setting.kind == "values" and isinstance(value, Mapping):
         return format_values(value)
     return list(value) if setting.kind == "vector" else value
 
 
 def to_parameters(values: Mapping[str, Any], cls: type[Settings]) -> dict[str, Any]:
-    """Parameters, as a parameter file holds them, that make a node read back these settings.
-
-    :param values: values by name, as the class's ``to_dict`` gives them.
-    :param cls: the settings class.
-    """
+    """Return parameters that make a node read back settings, given as the class's ``to_dict`` gives them."""
     return {
         setting.name: to_parameter(setting, values[setting.name])
         for setting in settings_of(cls)
         if setting.kind != "structure" and values.get(setting.name) is not None
     }
+
+
+def declare_swarm_namespace(node: Node) -> str:
+    """Declare the parameter ``swarm_namespace`` and return its value.
+
+    Default is the namespace that the node was started in, without the agent's own part: a node in ``/north`` or in
+    ``/north/cf3`` belongs to swarm ``/north``, one in ``/swarm`` or ``/cf3`` to ``/swarm``.
+
+    :raises ConfigError: if the value is no namespace.
+    """
+    own = node.get_namespace()
+    agent = _AGENT.fullmatch(own)
+    default = (agent["swarm"] if agent else own.rstrip("/")) or names.SWARM
+    text = "namespace of what the whole swarm shares; default: the node's own, without the agent's part"
+    setting = Setting("swarm_namespace", "text", default, text)
+    value = declare_setting(node, setting)
+    space = "/" + value.strip("/")
+    try:
+        validate_namespace(space)
+    except InvalidNamespaceException as error:
+        raise ConfigError(setting.name, value, "a namespace as /north") from error
+    return names.SWARM if space == "/" else space
+
+
+def swarm_wide_node(name: str, options: Mapping[str, Any] | None = None) -> tuple[Node, str]:
+    """Return a node that belongs to a whole swarm, made with further options for ``Node``, and the swarm's namespace.
+
+    :raises ConfigError: if the parameter ``swarm_namespace`` is no namespace.
+    """
+    node = Node(name, namespace=names.SWARM, **(options or {}))
+    try:
+        space = declare_swarm_namespace(node)
+        if space != node.get_namespace() == names.SWARM:  # the parameter names it, not the command line
+            node.destroy_node()
+            node = Node(name, namespace=space, **(options or {}))
+            declare_swarm_namespace(node)
+    except BaseException:
+        node.destroy_node()
+        raise
+    return node, space

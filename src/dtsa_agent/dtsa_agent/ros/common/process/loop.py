@@ -1,4 +1,4 @@
-"""The inner loop of a node that lives on one topic: waits, takes, calls back; nothing else on the way.
+"""The inner loop of a node that lives on one topic: waits, reads, calls back; nothing else on the way.
 
 rclpy's executors build their wait set anew for every message, which takes longer than a whole slot of the protocol.
 This loop keeps one wait set on one subscription. Whatever else the node has (parameter services, timers) is served by
@@ -8,13 +8,15 @@ an ordinary executor a few times a second.
 from __future__ import annotations
 
 import gc
+import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
@@ -22,15 +24,15 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.ros.common.wire.checks import UNREADABLE
-from dtsa_agent.ros.common.wire.intake import Intake
+from dtsa_agent.ros.common.wire.checks import UNREADABLE, Intake
 from dtsa_agent.ros.common.workarounds.taking import Taker
 from dtsa_agent.stop import Stop
 
 _POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
 HOUSEKEEPING_S = 0.1
-_SPIN_S = 5.0  # at the latest after so long an executor looks, too
+_SPIN_S = 5.0  # an executor looks for rarer things that often
 _MOST_DROPPED = 16  # messages thrown away in a row before others get their turn
+_SERVING_S, _END_S = 0.5, 2.0
 
 
 class _OwnHands(CallbackGroup):
@@ -47,16 +49,12 @@ class _OwnHands(CallbackGroup):
 
 
 class Feed:
-    """A subscription whose messages are taken by whoever wants them, when they want them.
+    """A subscription whose messages are read by its owner, at its own time.
 
-    :param node: the node that subscribes.
-    :param msg_type: type of the messages.
-    :param topic: what it subscribes to.
-    :param qos: quality of service.
-    :param raw: messages are taken as serialised bytes.
-    :param read: makes messages of serialised bytes, in place of rclpy.
+    :param raw: messages are given as serialised bytes.
     :param intake: counts messages that cannot be read; None: they are errors.
-    :param admits: says by a message, its number and its sender whether it is taken in; None: all are.
+    :param admits: says by a message and its sender whether it is received; None: all are.
+    :param read: makes messages of serialised bytes, in place of rclpy.
     """
 
     def __init__(
@@ -67,7 +65,7 @@ class Feed:
         qos: QoSProfile,
         raw: bool = False,
         intake: Intake | None = None,
-        admits: Callable[[Any, int | None, bytes | None], bool] | None = None,
+        admits: Callable[[Any, bytes | None], bool] | None = None,
         read: Callable[[bytes], Any] | None = None,
     ) -> None:
         self.subscription = node.create_subscription(
@@ -82,20 +80,15 @@ class Feed:
         self._stack.callback(self._taker.close)
 
     @property
-    def number(self) -> int | None:
-        """Number of the message taken last, as its publisher counts; None: not known."""
-        return self._taker.number
-
-    @property
     def sender(self) -> bytes | None:
-        """Participant of DDS that sent the message taken last, which is a process; None: not known."""
+        """Participant of DDS, which is a process, that sent the last message; None: not known."""
         return self._taker.sender
 
     def _never(self, message: Any) -> None:
         raise LocalProtocolError("an executor took a message that is not its own")
 
     def take(self) -> Any:
-        """A message that is there already, or None; also None after many that were not taken in."""
+        """Return a message that is there already, or None; also None after many that were not received."""
         taker = self._taker
         for _ in range(_MOST_DROPPED):
             try:
@@ -108,24 +101,17 @@ class Feed:
                     raise
                 self._intake.drop(UNREADABLE, f"no {self._type.__name__}: {(str(error).splitlines() or [''])[0]}")
                 continue
-            if self._admits is None or self._admits(message, taker.number, taker.sender):
+            if self._admits is None or self._admits(message, taker.sender):
                 return message
         return None
 
     def close(self) -> None:
-        """Gives the handles back."""
+        """Give the handles back."""
         self._stack.close()
 
 
 class Loop(Feed):
-    """Serves one subscription as fast as Python can, and the rest of its node now and then.
-
-    :param node: the node that subscribes.
-    :param msg_type: type of the messages.
-    :param topic: what it subscribes to.
-    :param qos: quality of service.
-    :param more: as for :class:`Feed`.
-    """
+    """Serves one subscription as fast as Python can, and the rest of its node now and then."""
 
     def __init__(self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, **more: Any) -> None:
         super().__init__(node, msg_type, topic, qos, **more)
@@ -138,10 +124,7 @@ class Loop(Feed):
         gc.freeze()  # nothing made so far is garbage: do not look at it again and again
 
     def wait(self, timeout_ns: int = _POLL_NS) -> Any:
-        """The next message, or None after a while.
-
-        :param timeout_ns: longest time to wait, ns.
-        """
+        """Return the next message, or None after a while."""
         wait_set = self._wait_set
         wait_set.clear_entities()
         wait_set.add_subscription(self.handle)
@@ -155,29 +138,28 @@ class Loop(Feed):
         """
         node = self._node
         waiting = {
-            "subscription": [one for one in node.subscriptions if not isinstance(one.callback_group, _OwnHands)],
+            "subscription": [s for s in node.subscriptions if not isinstance(s.callback_group, _OwnHands)],
             "timer": list(node.timers),
             "client": list(node.clients),
             "service": list(node.services),
         }
         if not any(waiting.values()):
             return False
-        if time.monotonic() > self._next_spin:  # an executor serves rarer things as well
+        if time.monotonic() > self._next_spin:
             self._next_spin = time.monotonic() + _SPIN_S
             return True
-        subscriptions, timers, clients, services = (len(entities) for entities in waiting.values())
+        subscriptions, timers, clients, services = map(len, waiting.values())
         with ExitStack() as stack:
             wait_set = _rclpy.WaitSet(subscriptions, 0, timers, clients, services, 0, node.context.handle)
             for kind, entities in waiting.items():
-                add = getattr(wait_set, f"add_{kind}")
                 for entity in entities:
                     stack.enter_context(entity.handle)
-                    add(entity.handle)
+                    getattr(wait_set, f"add_{kind}")(entity.handle)
             wait_set.wait(0)
             return any(wait_set.get_ready_entities(kind) for kind in waiting)
 
     def housekeeping(self) -> bool:
-        """Serves parameters and timers if it is time; whether it did."""
+        """Serve parameters and timers if it is time; return whether it was."""
         now = time.monotonic()
         if now < self._next_housekeeping:
             return False
@@ -191,12 +173,7 @@ class Loop(Feed):
         return True
 
     def run(self, on_message: Callable[[Any], bool], idle: Callable[[], None], stop: Stop) -> None:
-        """Calls back until ``on_message`` says False or a signal comes.
-
-        :param on_message: gets each message; says whether to go on.
-        :param idle: called about ten times a second.
-        :param stop: the flag.
-        """
+        """Call back until ``on_message`` returns False or a signal comes; ``idle`` about ten times a second."""
         while not stop:
             message = self.wait()
             if message is not None and not on_message(message):
@@ -207,7 +184,38 @@ class Loop(Feed):
                 raise ExternalShutdownException
 
     def close(self) -> None:
-        """Gives the handles back."""
+        """Give the handles back."""
         if self._executor is not None:
             self._executor.shutdown(timeout_sec=0)
         super().close()
+
+
+class Serving:
+    """Calls the callbacks of nodes in a thread of this name, from ``start`` to ``close``.
+
+    ``Executor.spin`` in a thread raises when the executor is shut down under it; this ends between two callbacks.
+    """
+
+    def __init__(self, context: Context, name: str, *nodes: Node) -> None:
+        self.executor = SingleThreadedExecutor(context=context)
+        for node in nodes:
+            self.executor.add_node(node)
+        self._context, self._closed = context, threading.Event()
+        self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End it: a callback under way is waited for, 2 s at most."""
+        self._closed.set()
+        if self._thread.is_alive():
+            self.executor.wake()
+            self._thread.join(_END_S)
+        self.executor.shutdown(timeout_sec=0)
+
+    def _serve(self) -> None:
+        with suppress(ExternalShutdownException):
+            while self._context.ok() and not self._closed.is_set():
+                self.executor.spin_once(timeout_sec=_SERVING_S)

@@ -5,40 +5,36 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-import re
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, MutableMapping, Sequence
-from contextlib import suppress
-from itertools import pairwise
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.workarounds._endless import mend
-from dtsa_agent.ros.common.workarounds.dds import by_udp, clean_shared_memory, limit_to_machine
-from dtsa_agent.ros.common.workarounds.kept_nodes import leave_kept_nodes
-
-from .loop import Stop
+from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_agent.stop import Stop, in_time
 
 _PR_SET_PDEATHSIG = 1
-_REALTIME = re.compile(rf"""^\s*["']?mode["']?\s*:\s*["']?{names.MODES[1]}\b""", re.MULTILINE)
 SUPERVISOR = "DTSA_SUPERVISOR"  # process id of the supervisor that started this node, if one did
 _MIDDLEWARE = "libfastrtps"  # Fast DDS 2
+_LONGEST_END_S = 20.0  # of a node; the middleware was seen to stand still when others left in the same moment
 
 
 def follow_supervisor() -> bool:
-    """Lets the kernel end this process when its supervisor ends, however that ends.
+    """Let the kernel end this process when its supervisor ends, however that ends; return whether there is one.
 
-    :returns: whether a supervisor started this process; it then answers for names and parameters, too.
+    A supervisor answers for names and parameters, too.
     """
     parent = os.environ.get(SUPERVISOR)
     if not parent:
@@ -50,29 +46,11 @@ def follow_supervisor() -> bool:
 
 
 def node_options(supervised: bool) -> dict[str, Any]:
-    """Arguments for ``Node``: a supervised node goes without the services that nobody would ask, and starts faster.
-
-    :param supervised: whether a supervisor started this process.
-    """
+    """Return arguments for ``Node``: a supervised node goes without services that nothing asks, and starts faster."""
     if not supervised:
         return {}
     silent = Parameter("start_type_description_service", value=False)
     return {"start_parameter_services": False, "enable_rosout": False, "parameter_overrides": [silent]}
-
-
-def in_real_time(words: Sequence[str]) -> bool:
-    """Whether a command line asks for ``mode:=realtime``: the middleware wants to know before there is a node.
-
-    :param words: with ROS's arguments; parameter files are looked into.
-    """
-    for option, value in pairwise(words):
-        if option in ("-p", "--param") and value == f"mode:={names.MODES[1]}":
-            return True
-        if option == "--params-file":
-            with suppress(OSError, UnicodeError):  # rclpy says what is wrong with it
-                if _REALTIME.search(Path(value).read_text(encoding="utf-8")):
-                    return True
-    return False
 
 
 def init_ros(args: list[str] | None, context: Context | None = None, domain_id: int | None = None) -> None:
@@ -88,7 +66,7 @@ def init_ros(args: list[str] | None, context: Context | None = None, domain_id: 
 
 
 def log_where_possible(environment: MutableMapping[str, str]) -> None:
-    """Lets ROS write its logs to a temporary directory if its own cannot be made or written to, and says so."""
+    """Let ROS write its logs to a temporary directory if its own cannot be made or written to, and say so."""
     home = environment.get("ROS_HOME") or os.path.join(os.path.expanduser("~"), ".ros")
     directory = Path(environment.get("ROS_LOG_DIR") or os.path.join(home, "log"))
     try:
@@ -100,46 +78,39 @@ def log_where_possible(environment: MutableMapping[str, str]) -> None:
         print(f"{directory}: {error.strerror}: logs are in {environment['ROS_LOG_DIR']}", file=sys.stderr, flush=True)
 
 
-def run_node(
-    name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None = None, real_time: bool = False
-) -> int:
-    """Runs a node until it ends by itself or by SIGINT or SIGTERM.
+@contextmanager
+def ending(node: Node) -> Iterator[None]:
+    """Destroy a node at the end of the context; a process whose middleware hangs then says where, and ends."""
+    try:
+        yield
+    finally:
+        with in_time(_LONGEST_END_S):
+            node.destroy_node()
+
+
+def run_node(name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None = None) -> int:
+    """Run a node until it ends by itself or by SIGINT or SIGTERM; return its exit code.
+
+    0: a clean end (by a signal, too); 2: settings that are not usable; 1: other errors.
 
     :param name: what it calls itself in error messages.
     :param body: creates the node and runs it; gets the signal flag and whether a supervisor started this process.
     :param args: command line, default ``sys.argv``.
-    :param real_time: whether it is in real time always; otherwise its command line says so.
-    :returns: exit code: 0 for a clean end (by a signal, too), 2 for settings that are not usable, 1 for other errors.
     """
     supervised = follow_supervisor()
-    real_time = real_time or in_real_time(sys.argv if args is None else args)
-    limit_to_machine(os.environ, shared_memory=not (real_time or (supervised and by_udp(os.environ))))
-    if not supervised:  # a supervisor does that for all of them
-        clean_shared_memory()  # of the process, killed, whose place this one may take
+    limit_to_machine(os.environ)
     with Stop() as stop:
-        code = _run(name, body, args, stop, supervised)
-    leave_kept_nodes(code)
-    return code
-
-
-def _run(
-    name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None, stop: Stop, supervised: bool
-) -> int:
-    """The node itself; its exit code."""
-    try:
-        init_ros(list(args) if args is not None else None)
-    except Exception as error:  # rclpy's errors for a wrong command line have no common base
-        print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
-        return 2
-    try:
-        return body(stop, supervised) or 0
-    except ConfigError as error:
-        print(f"{name}: error: {error}", file=sys.stderr)
-        return 2
-    except DtsaError as error:
-        print(f"{name}: error: {error}", file=sys.stderr)
-        return 1
-    except ExternalShutdownException:
-        return 0
-    finally:
-        rclpy.try_shutdown()
+        try:
+            init_ros(list(args) if args is not None else None)
+        except Exception as error:  # rclpy's errors for a wrong command line have no common base
+            print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
+            return 2
+        try:
+            return body(stop, supervised) or 0
+        except DtsaError as error:
+            print(f"{name}: error: {error}", file=sys.stderr)
+            return 2 if isinstance(error, ConfigError) else 1
+        except ExternalShutdownException:
+            return 0
+        finally:
+            rclpy.try_shutdown()

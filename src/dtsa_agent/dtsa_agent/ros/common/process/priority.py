@@ -18,10 +18,7 @@ from dtsa_agent.core.settings.declaration import Settings, setting
 
 @dataclass(frozen=True, slots=True)
 class PrioritySettings(Settings):
-    """Who goes first on a computer.
-
-    :raises ConfigError: for values that are not allowed.
-    """
+    """Which processes go first on a computer."""
 
     priority: int = setting(
         0, "in real time: real-time priority of this process, where allowed; 0: none", minimum=0, maximum=90
@@ -29,11 +26,9 @@ class PrioritySettings(Settings):
 
 
 def take_priority(level: int, inherited: bool = True) -> str:
-    """Lets all threads of this process run before everything ordinary (SCHED_RR).
+    """Let all threads of this process run before everything ordinary (SCHED_RR); return why not, or an empty text.
 
-    :param level: 1 (low) to 99; 0: ordinary.
-    :param inherited: whether threads and processes that they start do so, too.
-    :returns: why not, or an empty text.
+    ``level``: 1 (low) to 99, 0: ordinary; ``inherited``: what they start does so, too.
     """
     policy = os.SCHED_RR if level else os.SCHED_OTHER
     if level and not inherited:
@@ -46,7 +41,7 @@ def take_priority(level: int, inherited: bool = True) -> str:
 
 
 def stay_on_one_processor() -> None:
-    """Keeps all threads of this process, and those that they start, on the last processor that it may use.
+    """Keep all threads of this process, and those that they start, on the last processor that it may use.
 
     Only one thread of an interpreter runs at a time. Threads that wake on several processors at once wait for each
     other there: a bridge of twelve Crazyflies takes half as much again. Only sensible with real-time priority: others
@@ -68,12 +63,10 @@ def give_way() -> None:
 
 
 def give_way_by(nice: int) -> str:
-    """Lets all threads of this process, and those that they start, give way to others, or go first.
+    """Let all threads of this process, and those that they start, give way to others; return why not, or nothing.
 
-    It counts among the processes of one session: Linux shares the processor between sessions before it looks at it.
-
-    :param nice: 0 (ordinary) to 19 (gives way to all); down to -20 with the right to go first.
-    :returns: why not, or an empty text.
+    ``nice``: 0 (ordinary) to 19 (gives way to all); down to -20 with the right to go first. It counts among the
+    processes of one session: Linux shares the processor between sessions before it looks at it.
     """
     try:
         _for_all_threads(lambda task: os.setpriority(os.PRIO_PROCESS, task, nice))
@@ -83,13 +76,7 @@ def give_way_by(nice: int) -> str:
 
 
 def take_place(priority: int, nice: int, inherited: bool = True) -> str:
-    """Real-time priority for this process where it may have it, nice otherwise.
-
-    :param priority: 1 (low) to 99; 0: none.
-    :param nice: nice level, -20 to 19, as for :func:`give_way_by`.
-    :param inherited: as for :func:`take_priority`.
-    :returns: why neither, or an empty text.
-    """
+    """Take real-time priority where this process may have it, else a nice level; return why neither, or nothing."""
     if priority and not take_priority(priority, inherited):
         return ""
     return give_way_by(nice) if nice else ""

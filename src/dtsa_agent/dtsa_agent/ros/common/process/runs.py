@@ -1,18 +1,72 @@
-"""A run's random id, how its channel calls the agents, and the proof that only this channel can end it."""
+"""A run's random id, how its channel calls the agents, the proof that only this channel can end it, and its process."""
 
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, dataclass
+from functools import cache
 from hashlib import sha256
+from pathlib import Path
 
 from dtsa_agent.ros.common.wire.checks import parse_json
 
-from .peers import ProcessName
-
 _PROOF_BYTES = 16
 _LONGEST = 4096  # bytes
-MOST_SESSIONS = 2**63
+_MOST_SESSIONS = 2**63
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessName:
+    """A process as others name it in messages; it can be looked for on its machine."""
+
+    node: str  # with the namespace
+    machine: str  # its boot and its process namespace
+    pid: int
+    started: int  # clock ticks after the boot
+
+    @classmethod
+    def own(cls, node: str) -> ProcessName:
+        """Return the name of this process, by its node's name with the namespace."""
+        return cls(node, _machine(), os.getpid(), _started(os.getpid()))
+
+    @property
+    def gone(self) -> bool:
+        """Whether the process has ended for sure. A stopped one has not; of other machines nothing is known."""
+        return self._of_here and _started(self.pid) != self.started
+
+    @property
+    def paused(self) -> bool:
+        """Whether the process is there but stopped, by a signal or a debugger; of other machines nothing is known."""
+        fields = _fields(self.pid) if self._of_here else []
+        return bool(fields) and fields[0] in (b"T", b"t") and int(fields[19]) == self.started
+
+    @property
+    def _of_here(self) -> bool:
+        return bool(self.started) and self.machine == _machine() and self.pid > 0
+
+
+@cache
+def _machine() -> str:
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:  # another kernel
+        return ""
+
+
+def _started(pid: int) -> int:
+    """Return when a process started, in clock ticks after the boot; 0: there is none, or it is a zombie."""
+    fields = _fields(pid)
+    return int(fields[19]) if fields and fields[0] not in (b"Z", b"X") else 0
+
+
+def _fields(pid: int) -> list[bytes]:
+    """Return what the kernel says about a process, from its state on; nothing if there is none."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+    except OSError:
+        return []
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,23 +83,17 @@ class Run:
 
     @classmethod
     def draw(cls, session: int = 0) -> Run:
-        """A new one: no two runs share one.
-
-        :param session: session of authenticated frames; 0: a random one.
-        """
+        """Return a new one: no two runs share one. ``session``: of authenticated frames; 0: a random one."""
         import secrets  # channels draw, agents do not
 
         proof = secrets.token_bytes(_PROOF_BYTES)
-        return cls(secrets.randbelow(2**32 - 1) + 1, proof, session or secrets.randbelow(MOST_SESSIONS - 1) + 1)
+        return cls(secrets.randbelow(2**32 - 1) + 1, proof, session or secrets.randbelow(_MOST_SESSIONS - 1) + 1)
 
     def __str__(self) -> str:
         return run_text(self.number)
 
     def call(self, node: str) -> bytes:
-        """The call of a channel in this process, as slot messages carry it.
-
-        :param node: name of the channel's node, with the namespace.
-        """
+        """Return the call of a channel in this process, of a node of this name, as slot messages carry it."""
         return Call(ProcessName.own(node), sha256(self.proof).hexdigest(), self.session).to_bytes()
 
 
@@ -59,7 +107,7 @@ class Call:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Call:
-        """What :meth:`to_bytes` made.
+        """Return the call that :meth:`to_bytes` wrote.
 
         :raises ValueError: for anything else.
         """
@@ -73,12 +121,12 @@ class Call:
             if type(given[name]) is not kind:
                 raise ValueError(f"{name} of a call: {given[name]!r:.40}")
         end, session = given.pop("end"), given.pop("session")
-        if not 0 < session < MOST_SESSIONS:
+        if not 0 < session < _MOST_SESSIONS:
             raise ValueError(f"session {session} of a call")
         return cls(ProcessName(**given), end, session)
 
     def to_bytes(self) -> bytes:
-        """As JSON."""
+        """Return the call as JSON."""
         values = {**asdict(self.channel), "end": self.end, "session": self.session}
         return json.dumps(values, separators=(",", ":")).encode()
 
@@ -88,8 +136,5 @@ class Call:
 
 
 def run_text(number: int) -> str:
-    """A run's id as logs and bags show it.
-
-    :param number: the id.
-    """
+    """Return a run's id as logs and bags show it."""
     return f"{number:08x}"

@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from typing import Any
 
-_FIRST_S = 2.0
-_LONGEST_S = 60.0
+_FIRST_S, _LONGEST_S = 2.0, 60.0  # from one line to the next
 _LONGEST_LOOK_S = 0.25
 
 
 class Patience:
-    """How long this process has looked for something in vain.
+    """For how long this process has looked for something in vain.
 
-    Time in which it did not run (Ctrl-Z, a debugger, a frozen container) does not count: what the others have said
+    Time in which it did not run (Ctrl-Z, a debugger, a frozen container) does not count: what the others have sent
     meanwhile has not reached it yet.
     """
 
@@ -22,7 +21,7 @@ class Patience:
         self._spent_s = 0.0
 
     def look(self) -> float:
-        """Called at every look, several times a second; gives the s of wall time spent so far."""
+        """Return the s of wall time spent so far; called several times a second."""
         now = time.monotonic()
         self._spent_s += min(now - self._looked_s, _LONGEST_LOOK_S)
         self._looked_s = now
@@ -30,22 +29,15 @@ class Patience:
 
 
 class Waiting:
-    """Says that somebody waits, at once and then with a growing period; anew when it waits for something else.
-
-    :param logger: the node's logger.
-    """
+    """Logs what is waited for, at once and then with a growing period; anew when it is something else."""
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger
         self._text = ""
-        self._since_s = self._next_s = 0.0  # time.monotonic()
-        self._period_s = _FIRST_S
+        self._since_s = self._next_s = self._period_s = 0.0  # time.monotonic()
 
     def tell(self, text: str) -> None:
-        """Says it if it is time to; called as often as one likes.
-
-        :param text: what is waited for.
-        """
+        """Log it if it is time to."""
         now = time.monotonic()
         if text != self._text:
             self._text, self._since_s, self._next_s, self._period_s = text, now, now + _FIRST_S, _FIRST_S

@@ -1,4 +1,4 @@
-"""Checks of what comes in over the graph: one function a message type, used by all who take that type in.
+"""Checks of what comes in over the graph: one function a message type; what is not received is counted by reason.
 
 A check raises :class:`Unusable` with one of the reasons below; nothing else about the message may be believed then.
 """
@@ -8,7 +8,9 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from dtsa_msgs.msg import Process, Slot
@@ -31,32 +33,80 @@ REASONS = (UNREADABLE, OTHER_RUN, OTHER_SENDER, UNKNOWN, SIZES, RANGE, SLOT, FOR
 LARGEST_SLOT = names.FIRST_CALL - 1  # 248 days of 10 ms slots
 FARTHEST_M = 1e6  # no vehicle is farther from the room's centre, or faster, than this many m or m/s
 FARTHEST_ODOMETRY_M, FASTEST_ODOMETRY_MPS = 1000.0, 100.0  # of vehicles that really fly
-_WINDOW = 1000  # messages of one publisher that may have been missed
-_SILENT_S = 0.3  # after such a silence the numbers may begin elsewhere
-_LONGEST_TEXT = 65536
-_LONGEST_NAME = 200
+_SILENT_S = 0.3  # after such a silence another publisher may take over
+_LONGEST_TEXT, _LONGEST_NAME, _LONGEST_LINE = 65536, 200, 300  # characters
 _MOST_REASONS = 64
+_LOG_S = 5.0  # from one line in the log to the next
 
 
 class Unusable(RemoteProtocolError):
-    """A message that is not taken in.
-
-    :param reason: one of :data:`REASONS`.
-    :param detail: what is wrong with it.
-    """
+    """A message that is not received, for one of :data:`REASONS`; the text says what is wrong with it."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(detail)
         self.reason = reason
 
 
-def check_slot(message: Slot, agents: int) -> None:
-    """A slot message whose fields fit together.
+class Intake:
+    """Counts messages that were not received, by reason, and logs it now and then if there is a logger."""
 
-    :param message: the message.
-    :param agents: number of agents N.
-    :raises Unusable: if they do not.
+    def __init__(self, logger: Any = None) -> None:
+        self._logger = logger
+        self._next_line_s = 0.0
+        self.counts: dict[str, int] = {}  # by reason
+
+    @property
+    def total(self) -> int:
+        """Number of all messages dropped."""
+        return sum(self.counts.values())
+
+    def drop(self, reason: str, detail: str) -> None:
+        """Count a message."""
+        self.counts[reason] = self.counts.get(reason, 0) + 1
+        now = time.monotonic()
+        if self._logger is not None and now >= self._next_line_s:
+            self._next_line_s = now + _LOG_S
+            self._logger.warning(f"not taken in ({reason}): {detail}; {self.total} so far"[:_LONGEST_LINE])
+
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Drop and count what is :class:`Unusable` within."""
+        try:
+            yield
+        except Unusable as error:
+            self.drop(error.reason, str(error))
+
+
+def add_counts(total: dict[str, int], more: Mapping[str, int]) -> None:
+    """Add counts by reason to a total."""
+    for reason, count in more.items():
+        total[reason] = total.get(reason, 0) + count
+
+
+class OnePublisher:
+    """Admits the messages of one publisher: of a given sender, or of the first one until it has been silent.
+
+    Where a middleware does not name senders this is off.
     """
+
+    __slots__ = ("_only", "_sender", "_time_s")
+
+    def __init__(self, sender: bytes | None = None) -> None:
+        self._only = self._sender = sender
+        self._time_s = 0.0
+
+    def admits(self, now_s: float, sender: bytes | None) -> bool:
+        """Return whether a message may be the next one of the publisher (``now_s``: s, monotonic)."""
+        if sender is None:
+            return True
+        if sender != self._sender and (self._only is not None or now_s - self._time_s < _SILENT_S):
+            return False
+        self._sender, self._time_s = sender, now_s
+        return True
+
+
+def check_slot(message: Any, agents: int) -> None:
+    """Check that the fields of a dtsa_msgs/Slot fit together, for N agents."""
     phase, senders, lengths, received = message.phase, message.sender, message.length, message.received
     count = len(senders)
     if phase > Slot.REFUSE:
@@ -72,9 +122,8 @@ def check_slot(message: Slot, agents: int) -> None:
             raise Unusable(SIZES, "slot message with frames of nobody")
         return
     if len(lengths) != count or len(received) != count * ((agents + 7) // 8):
-        raise Unusable(
-            SIZES, f"slot message: {count} senders, {len(lengths)} lengths, {len(received)} bytes of receivers"
-        )
+        detail = f"{count} senders, {len(lengths)} lengths, {len(received)} bytes of receivers"
+        raise Unusable(SIZES, f"slot message: {detail}")
     check_frames(lengths, message.data)
     if not all(lengths):
         raise Unusable(SIZES, "slot message with an empty frame")
@@ -82,12 +131,7 @@ def check_slot(message: Slot, agents: int) -> None:
 
 
 def check_frames(lengths: Sequence[int], data: Any) -> None:
-    """Frames that are as long as the air carries, and as the bytes that are there.
-
-    :param lengths: bytes, one a frame.
-    :param data: the frames one after the other.
-    :raises Unusable: if they are not.
-    """
+    """Check that frames are as long as the air carries, and as the bytes that are there."""
     if sum(lengths) != len(data):
         raise Unusable(SIZES, f"{len(data)} bytes of frames, {sum(lengths)} in their lengths")
     if len(lengths) and max(lengths) > FRAME_MAX:
@@ -95,13 +139,7 @@ def check_frames(lengths: Sequence[int], data: Any) -> None:
 
 
 def check_ids(ids: Sequence[int], agents: int, ascending: bool = True) -> None:
-    """Different ids of agents that exist.
-
-    :param ids: the ids.
-    :param agents: number of agents N.
-    :param ascending: whether they have to be in order.
-    :raises Unusable: if they are not, or there are none.
-    """
+    """Check that ids are those of different agents of N, one at least, and in order if they have to be."""
     count = len(ids)
     if not count or count > agents or min(ids) < 1 or max(ids) > agents:
         raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}; allowed: 1 to {agents}")
@@ -110,13 +148,7 @@ def check_ids(ids: Sequence[int], agents: int, ascending: bool = True) -> None:
 
 
 def check_numbers(name: str, values: Iterable[float], largest: float = FARTHEST_M) -> None:
-    """Finite numbers of a size that can be.
-
-    :param name: what they are.
-    :param values: numbers of any unit.
-    :param largest: largest magnitude, of the same unit.
-    :raises Unusable: if there are others.
-    """
+    """Check that numbers are finite and not beyond a magnitude."""
     for value in values:
         if not math.isfinite(value):
             raise Unusable(RANGE, f"{name} that are no numbers")
@@ -125,25 +157,16 @@ def check_numbers(name: str, values: Iterable[float], largest: float = FARTHEST_
 
 
 def check_start(start_ns: int, now_ns: int, early_ns: int = 10_000_000_000, late_ns: int = 60_000_000_000) -> None:
-    """The start of a transmission that can be under way: clocks are off, but not by that much.
+    """Check that a transmission that starts then can be under way: clocks are off, but not by more than these limits.
 
-    :param start_ns: ns, time of the start on the channel's time line.
-    :param now_ns: ns, now on that time line.
-    :param early_ns: ns by which it may lie ahead.
-    :param late_ns: ns by which it may have passed.
-    :raises Unusable: if it lies elsewhere.
+    Times are ns on the channel's time line.
     """
     if not now_ns - late_ns <= start_ns <= now_ns + early_ns:
         raise Unusable(SLOT, f"a transmission that starts {(start_ns - now_ns) / 1e9:.3g} s from now")
 
 
 def check_process(message: Process, agents: int) -> None:
-    """A message of a process that can be.
-
-    :param message: the message.
-    :param agents: number of agents N.
-    :raises Unusable: if it cannot.
-    """
+    """Check what a process says about itself, in a swarm of N agents."""
     check_ids(message.agent, agents)
     if len(message.dropped_reason) != len(message.dropped) or len(message.dropped) > _MOST_REASONS:
         raise Unusable(SIZES, f"{len(message.dropped)} counts for {len(message.dropped_reason)} reasons")
@@ -152,11 +175,7 @@ def check_process(message: Process, agents: int) -> None:
 
 
 def check_odometry(message: Odometry) -> None:
-    """A measured place, attitude and velocity that a vehicle of a swarm can have.
-
-    :param message: the message.
-    :raises Unusable: for others.
-    """
+    """Check that a vehicle of a swarm can have the position, attitude and velocity of a message."""
     place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
     check_numbers("places", (place.x, place.y, place.z), FARTHEST_ODOMETRY_M)
     check_numbers("velocities", (speed.x, speed.y, speed.z), FASTEST_ODOMETRY_MPS)
@@ -166,7 +185,7 @@ def check_odometry(message: Odometry) -> None:
 
 
 def parse_json(data: bytes | str) -> Any:
-    """What a text of JSON holds.
+    """Return what a text of JSON holds.
 
     :raises ValueError: for any other text, one too deep included.
     """
@@ -177,41 +196,5 @@ def parse_json(data: bytes | str) -> Any:
 
 
 def plain(text: str) -> str:
-    """A text from outside as it can stand in one line."""
+    """Return a text from outside as it can stand in one line."""
     return "".join(letter if letter.isprintable() else "?" for letter in text[:_LONGEST_NAME])
-
-
-class OnePublisher:
-    """Tells the messages of one publisher from others', by who sent them.
-
-    Where a middleware does not say that, by their numbers, which each publisher counts for itself: another publisher's
-    lie elsewhere unless both have sent about as much. After a silence any number is taken, and any sender where none
-    was given: nobody can take the place of the right one for long. Without senders and numbers this is off.
-
-    :param sender: the only one whose messages are ever taken; None: whoever is heard first.
-    """
-
-    __slots__ = ("_last", "_only", "_sender", "_time_s")
-
-    def __init__(self, sender: bytes | None = None) -> None:
-        self._only = self._sender = sender
-        self._last, self._time_s = 0, 0.0
-
-    def admits(self, number: int | None, now_s: float, sender: bytes | None = None) -> bool:
-        """Whether a message can be the next of the same publisher; it is taken for that then.
-
-        :param number: the message's number; 0 or None: not known.
-        :param now_s: s, monotonic.
-        :param sender: who sent it; None: not known.
-        """
-        if sender is not None:
-            if sender != self._sender and (self._only is not None or now_s - self._time_s < _SILENT_S):
-                return False
-            self._sender, self._time_s = sender, now_s
-            return True
-        if not number:
-            return True
-        if not 0 < number - self._last <= _WINDOW and now_s - self._time_s < _SILENT_S:
-            return False
-        self._last, self._time_s = number, now_s
-        return True

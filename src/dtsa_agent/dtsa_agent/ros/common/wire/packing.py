@@ -1,4 +1,4 @@
-"""How frames and receiver bits lie in the messages of dtsa_msgs. Needs no ROS: recorders and verifiers use it too."""
+"""How frames and receiver bits lie in the messages of dtsa_msgs, and covariances of odometry. Needs no ROS."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 RUN_BYTES = slice(20, 24)
 RUN_MESSAGES = frozenset(
     f"dtsa_msgs/msg/{name}"
-    for name in (
+    for name in [
         "Slot",
         "Transmission",
         "Frame",
@@ -22,32 +22,36 @@ RUN_MESSAGES = frozenset(
         "Configuration",
         "RunStatus",
         "SlotRecord",
-    )
+    ]
 )
+
+# Row-major 6 x 6 over (x, y, z, rotation about x, y, z), in m^2 and rad^2, (m/s)^2 and (rad/s)^2. Zeros would say that
+# a value is exact.
+PRECISION = 1e-6  # m^2 or (m/s)^2: a millimetre, a millimetre per second
+UNKNOWN = 1e6  # nothing is known about this value
+
+
+def diagonal(linear: float, angular: float) -> NDArray[np.float64]:
+    """Return a covariance without correlations, (36,), by the variances of the first and of the last three values."""
+    return np.diag([linear] * 3 + [angular] * 3).ravel()
+
+
+POSE_COVARIANCE = TWIST_COVARIANCE = diagonal(PRECISION, UNKNOWN)  # of simulated bodies: the attitude is not modelled
 
 
 def without_run(data: bytes | memoryview) -> bytes:
-    """A message of :data:`RUN_MESSAGES` with the run's id blanked.
-
-    :param data: the message as CDR.
-    """
+    """Return a message of :data:`RUN_MESSAGES`, as CDR, with the run's id blanked."""
     return b"".join((data[: RUN_BYTES.start], bytes(4), data[RUN_BYTES.stop :]))
 
 
 def pack_received(mask: NDArray[np.bool_]) -> bytes:
-    """The field ``received``: one bit an agent and frame.
-
-    :param mask: (F, N): the agent with id column + 1 received the frame.
-    """
+    """Return the field ``received``, one bit an agent and frame, of a mask (F, N) by frame and agent."""
     return np.packbits(mask, axis=1, bitorder="little").tobytes()
 
 
 def unpack_received(data: bytes | memoryview, frames: int, agents: int) -> NDArray[np.uint8]:
-    """The mask (F, N), 0 or 1, that :func:`pack_received` packed.
+    """Return the mask (F, N), 0 or 1, that :func:`pack_received` packed.
 
-    :param data: the field.
-    :param frames: number of frames F.
-    :param agents: number of agents N.
     :raises ValueError: if the field's length does not fit.
     """
     rows = np.frombuffer(data, dtype=np.uint8).reshape(frames, (agents + 7) // 8)
@@ -55,9 +59,8 @@ def unpack_received(data: bytes | memoryview, frames: int, agents: int) -> NDArr
 
 
 def split_frames(data: bytes | memoryview, lengths: Sequence[int]) -> list[bytes]:
-    """The frames that lie one after the other in ``data``.
+    """Return the frames that lie one after the other in ``data``, by their lengths in bytes; 0 gives an empty one.
 
-    :param lengths: bytes, length of each; 0 gives an empty one.
     :raises ValueError: if the lengths do not add up to the data.
     """
     frames, at, whole = [], 0, bytes(data)

@@ -1,7 +1,7 @@
-"""Takes messages as bytes, and says who sent them: rclpy knows, but hands it out with no message.
+"""Pops messages as bytes, and says which process sent them: rclpy knows, but hands it out with no message.
 
 Called through ``ctypes``: one function of rcl, with the message information that it fills in. Where that cannot be had
-(another middleware, another distribution) there is no sender, and its numbers have to tell (:class:`OnePublisher`).
+(another middleware, another distribution) there is no sender.
 
 Upstream: rclpy, issue 1465 (`publisher_gid` in the information of a message; done in pull request 1466).
 Delete when: the distribution that is used is one after Jazzy whose rclpy has it.
@@ -28,29 +28,19 @@ class _Allocator(ctypes.Structure):
 
 
 class _Bytes(ctypes.Structure):
-    _fields_ = [
-        ("buffer", ctypes.c_void_p),
-        ("length", ctypes.c_size_t),
-        ("capacity", ctypes.c_size_t),
-        ("allocator", _Allocator),
-    ]
+    _fields_ = [("buffer", ctypes.c_void_p), *((n, ctypes.c_size_t) for n in ("length", "capacity")), ("_", _Allocator)]
 
 
 class _Information(ctypes.Structure):
     _fields_ = [
-        ("source_timestamp", ctypes.c_int64),
-        ("received_timestamp", ctypes.c_int64),
-        ("publication_sequence_number", ctypes.c_uint64),
-        ("reception_sequence_number", ctypes.c_uint64),
-        ("implementation", ctypes.c_char_p),
-        ("publisher", ctypes.c_uint8 * 16),
-        ("intra_process", ctypes.c_bool),
-    ]
+        *((n, ctypes.c_uint64) for n in ("sent", "received", "publication_number", "reception_number")),
+        ("implementation", ctypes.c_char_p), ("publisher", ctypes.c_uint8 * 16), ("intra_process", ctypes.c_bool),
+    ]  # fmt: skip
 
 
 @cache
 def _libraries() -> tuple[Any, Any] | None:
-    """rcl and rcutils of this process; None where the structures above are not theirs."""
+    """Return rcl and rcutils of this process; None where the structures above are not theirs."""
     known = rclpy.get_rmw_implementation_identifier().startswith(_MIDDLEWARE)
     if not known or os.environ.get("ROS_DISTRO", _DISTRIBUTION) != _DISTRIBUTION:
         return None
@@ -66,14 +56,10 @@ def _libraries() -> tuple[Any, Any] | None:
 
 
 class Taker:
-    """Takes the messages of one subscription; its handle has to be held open meanwhile.
-
-    :param handle: rclpy's handle of the subscription.
-    """
+    """Pops the messages of one subscription; its handle, rclpy's, has to be held open meanwhile."""
 
     def __init__(self, handle: Any) -> None:
-        self.number: int | None = None  # of the message taken last, as its publisher counts
-        self.sender: bytes | None = None  # participant that sent it; None: not known
+        self.sender: bytes | None = None  # participant that sent the last message; None: not known
         self._handle, self._libraries = handle, _libraries()
         if self._libraries is not None:
             rcl, rcutils = self._libraries
@@ -81,33 +67,28 @@ class Taker:
             allocator = rcutils.rcutils_get_default_allocator()
             rcutils.rcutils_uint8_array_init(ctypes.byref(self._bytes), _FIRST_BYTES, ctypes.byref(allocator))
             self._take, self._reset = rcl.rcl_take_serialized_message, rcutils.rcutils_reset_error
-            self._words = handle.pointer, ctypes.addressof(self._bytes), ctypes.addressof(self._information), None
+            self._arguments = handle.pointer, ctypes.addressof(self._bytes), ctypes.addressof(self._information), None
             self._sender_at = ctypes.addressof(self._information) + _Information.publisher.offset
 
     def take(self) -> bytes | None:
-        """A message that is there already, as CDR, or None.
+        """Return a message that is there already, as CDR, or None.
 
         :raises RuntimeError: if rcl cannot take it.
         """
         if self._libraries is None:
             taken = self._handle.take_message(None, True)
-            if taken is None:
-                return None
-            data, information = taken
-            self.number = information["publication_sequence_number"]
-            return bytes(data)
-        code = self._take(*self._words)
+            return None if taken is None else bytes(taken[0])
+        code = self._take(*self._arguments)
         if code:
             if code == _TAKE_FAILED:
                 return None
             self._reset()
             raise RuntimeError(f"rcl error {code}")
-        self.number = self._information.publication_sequence_number
         self.sender = ctypes.string_at(self._sender_at, _PARTICIPANT_BYTES)
         return ctypes.string_at(self._bytes.buffer, self._bytes.length)
 
     def close(self) -> None:
-        """Frees the buffer."""
+        """Free the buffer."""
         if self._libraries is not None:
             self._libraries[1].rcutils_uint8_array_fini(ctypes.byref(self._bytes))
-            self._take = lambda *words: _TAKE_FAILED
+            self._take = lambda *arguments: _TAKE_FAILED
