@@ -18,7 +18,7 @@ from typing import IO, Any
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.node.bridge import Bridge
-from dtsa_agent.crazyflie.settings.config import parse_swarm
+from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_agent.crazyflie.state import conversions
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_bench.crazyflies.simulated import send_fault

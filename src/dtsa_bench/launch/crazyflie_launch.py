@@ -23,7 +23,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.settings.config import load_swarm
+from dtsa_agent.crazyflie.settings import load_swarm
 
 CRAZYSWARM2 = "crazyswarm2"
 LAND_S = "60.0"  # from Ctrl-C until SIGTERM: all land first

@@ -18,7 +18,7 @@ from dtsa_agent.crazyflie.links.outbox import Outbox
 from dtsa_agent.crazyflie.motion.controls import LAND, TAKEOFF, Delivery
 from dtsa_agent.crazyflie.motion.limits import check_stream, outside_fence
 from dtsa_agent.crazyflie.safety.rules import ESTIMATE_HOLD_S, Action, SafetyMonitor, SafetySettings, Watched
-from dtsa_agent.crazyflie.settings.config import StationSettings
+from dtsa_agent.crazyflie.settings import StationSettings
 from dtsa_agent.crazyflie.state import conversions
 from dtsa_agent.crazyflie.state import state_machine as sm
 from dtsa_agent.crazyflie.state.conversions import Setpoint

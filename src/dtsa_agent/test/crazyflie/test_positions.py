@@ -19,7 +19,7 @@ from waiting import wait_for
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.positions.estimates import EstimateWatch, Settling
 from dtsa_agent.crazyflie.positions.motion_capture import MOVED_AGAIN, PositionSettings, Tracker
-from dtsa_agent.crazyflie.settings.config import RobotSettings, StationSettings, parse_swarm
+from dtsa_agent.crazyflie.settings import RobotSettings, StationSettings, parse_swarm
 from dtsa_agent.crazyflie.state.conversions import VehicleState
 from dtsa_agent.crazyflie.vehicle.known_state import KnownState
 

@@ -65,18 +65,15 @@ def use_simulated_radio(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the bridge until Ctrl-C."""
+    from dtsa_agent.crazyflie.addresses import check_budget
     from dtsa_agent.crazyflie.links.link import require_cflib
-    from dtsa_agent.crazyflie.settings.config import load_swarm
-    from dtsa_agent.crazyflie.settings.radio_budget import check_budget, radio_loads
+    from dtsa_agent.crazyflie.settings import load_swarm
 
     use_simulated_radio(args)
     settings = load_swarm(args.config)
     if args.check == FILE:
-        loads = radio_loads(settings.radio_rates())
-        print(f"{args.config}: {len(settings.robots)} Crazyflies")
-        for load in loads:
-            print(load)
-        check_budget(loads, force=settings.station.force_budget)
+        print("\n".join([f"{args.config}: {len(settings.robots)} Crazyflies", *settings.summary()]))
+        check_budget(settings.loads, force=settings.station.force_budget)
         return 0
     require_cflib()
     with ExitStack() as stack:
@@ -104,7 +101,7 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     """
     import yaml
 
-    from dtsa_agent.crazyflie.settings.config import load_swarm
+    from dtsa_agent.crazyflie.settings import load_swarm
     from dtsa_bench.crazyflies.simulated.process import FIRST, FleetError, free_base_port, running_fleet
 
     data = yaml.safe_load(config.read_text(encoding="utf-8"))

@@ -183,7 +183,7 @@ def late_agents(text: str | None) -> dict[int, float]:
 def run_crazyflies(args: argparse.Namespace) -> int:
     """A mission; 1 when a vehicle cut the exchange short or agents did not hear each other, 130 when interrupted."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_agent.crazyflie.settings.config import load_swarm
+    from dtsa_agent.crazyflie.settings import load_swarm
 
     if args.config is None:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")

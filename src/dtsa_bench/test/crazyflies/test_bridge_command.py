@@ -30,7 +30,7 @@ from ground_helpers import Bridge, running
 from node_helpers import ros_graph
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.settings.config import load_swarm
+from dtsa_agent.crazyflie.settings import load_swarm
 from dtsa_bench.commands.bridge import simulated
 from dtsa_bench.crazyflies.simulated import process as simulated_process
 from dtsa_bench.crazyflies.simulated.process import free_base_port

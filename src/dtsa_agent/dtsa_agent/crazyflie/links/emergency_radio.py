@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from dtsa_agent.crazyflie.settings.radio_budget import radio_of
+from dtsa_agent.crazyflie.addresses import parse_address
 
 BROADCAST = (0xFF, 0xE7, 0xE7, 0xE7, 0xE7)
 # Emergency stop by the supervisor's port, and by the localization's, where firmware before protocol version 12 has it.
@@ -27,7 +27,7 @@ class EmergencyRadio:
     def __init__(self, uris: Sequence[str], log: Callable[[str, str], None]) -> None:
         from cflib.crtp.radiodriver import RadioDriver
 
-        radio_uris = [uri for uri in uris if radio_of(uri) is not None]
+        radio_uris = [uri for uri in uris if parse_address(uri).radio]
         self._log = log
         self._links: list[tuple[int, int, int]] = []  # dongle, channel, data rate
         self._thread: threading.Thread | None = None

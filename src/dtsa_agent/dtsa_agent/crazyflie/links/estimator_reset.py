@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from dtsa_agent.crazyflie.addresses import LinkError
 from dtsa_agent.crazyflie.positions.estimates import Settling
 from dtsa_agent.crazyflie.state.conversions import Vector
 
-from .outbox import LinkError, Position
+from .outbox import Position
 
 VARIANCES = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
 PLACE = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")

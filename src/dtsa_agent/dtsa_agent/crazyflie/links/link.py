@@ -22,13 +22,14 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.crazyflie.addresses import LinkError
+from dtsa_agent.crazyflie.onboard import BoardOrders
 from dtsa_agent.crazyflie.positions.estimates import Settling
-from dtsa_agent.crazyflie.settings.config import RobotSettings
+from dtsa_agent.crazyflie.settings import RobotSettings
 from dtsa_agent.crazyflie.state.conversions import LOG_VARIABLES, Setpoint, Vector, VehicleState, decode_log
 
-from .board_orders import BoardOrders
 from .estimator_reset import settle
-from .outbox import LinkError, Order, Outbox, Position
+from .outbox import Order, Outbox, Position
 from .radio_link import Heard, RadioPort, keep_links_open, packets_of
 
 SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Crazyradios, for simulation only

@@ -13,10 +13,6 @@ from dtsa_agent.crazyflie.state.conversions import Setpoint
 Order = Callable[[], None]
 
 
-class LinkError(Exception):
-    """A connection could not be made; the text says why."""
-
-
 @dataclass(frozen=True, slots=True)
 class Position:
     """Where motion capture sees a Crazyflie."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dtsa_agent.crazyflie.links.link import Link
-from dtsa_agent.crazyflie.settings.config import StationSettings
+from dtsa_agent.crazyflie.settings import StationSettings
 from dtsa_agent.crazyflie.state.conversions import Setpoint, Vector, velocity_world
 
 from .limits import landing_s

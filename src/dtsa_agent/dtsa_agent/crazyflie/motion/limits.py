@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from dtsa_agent.crazyflie.settings.config import StationSettings
+from dtsa_agent.crazyflie.settings import StationSettings
 from dtsa_agent.crazyflie.state.conversions import (
     FULL_STATE,
     POSITION,

@@ -16,13 +16,12 @@ from queue import SimpleQueue
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.scenario import make_scenario
-from dtsa_agent.crazyflie.links.board_orders import BoardOrders
+from dtsa_agent.crazyflie.addresses import WATCHDOG_HZ, check_budget, parse_address
 from dtsa_agent.crazyflie.links.emergency_radio import EmergencyRadio
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO, require_cflib
+from dtsa_agent.crazyflie.onboard import BoardOrders, key_of, orders, parameters
 from dtsa_agent.crazyflie.safety.rules import Action, SafetyMonitor, Verdict
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
-from dtsa_agent.crazyflie.settings.on_board import key_of, orders, parameters
-from dtsa_agent.crazyflie.settings.radio_budget import WATCHDOG_HZ, check_budget, radio_loads
+from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state.conversions import VehicleState
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_agent.crazyflie.vehicle.reports import Snapshot, snapshot, watched
@@ -48,7 +47,7 @@ class Ownership:
             directory.mkdir(mode=0o700)
         for name, uri in robots:
             air = os.environ.get(SIMULATED_RADIO, "") if uri.startswith("radio://") else ""  # one of several
-            address = air + uri.partition("?")[0].lower()
+            address = air + parse_address(uri).link
             file = os.open(directory / hashlib.sha256(address.encode()).hexdigest(), os.O_CREAT | os.O_RDWR, 0o600)
             self._files.append(file)
             try:
@@ -80,13 +79,9 @@ class Bridge:
     ) -> None:
         self.settings = settings
         station = settings.station
-        loads = radio_loads(settings.radio_rates())
-        for load in loads:
-            log("info" if load.fits else "warn", str(load))
-        wired = len(settings.robots) - sum(len(load.robots) for load in loads)
-        if wired:
-            log("info", f"{wired} Crazyflies without a radio (udp, usb): no budget")
-        check_budget(loads, force=station.force_budget)
+        for line in settings.summary():
+            log("info", line)
+        check_budget(settings.loads, force=station.force_budget)
         require_cflib()
         self._ownership = Ownership((robot.name, robot.uri) for robot in settings.robots)
         self._log = log

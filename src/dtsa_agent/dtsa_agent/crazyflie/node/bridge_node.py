@@ -25,7 +25,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import named
 from dtsa_agent.crazyflie.positions.motion_capture import PositionSettings
 from dtsa_agent.crazyflie.safety.rules import SafetySettings
-from dtsa_agent.crazyflie.settings.config import SwarmSettings, load_swarm
+from dtsa_agent.crazyflie.settings import SwarmSettings, load_swarm
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_agent.ros.common.graph.parameters import declare_settings
 from dtsa_agent.ros.common.process.loop import Serving

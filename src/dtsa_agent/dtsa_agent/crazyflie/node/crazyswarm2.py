@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state import conversions
 from dtsa_agent.crazyflie.state.conversions import Vector, VehicleState
 from dtsa_agent.crazyflie.vehicle.onboard import Parameter

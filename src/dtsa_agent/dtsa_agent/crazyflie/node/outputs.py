@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from dtsa_agent.crazyflie.positions.motion_capture import PositionNumbers
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state import conversions
 from dtsa_agent.crazyflie.state.conversions import VehicleState, to_map
 from dtsa_agent.crazyflie.state.state_machine import State

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from dtsa_agent.crazyflie.motion.limits import outside_fence
-from dtsa_agent.crazyflie.settings.config import RobotSettings, SwarmSettings
-from dtsa_agent.crazyflie.settings.radio_budget import radio_loads
+from dtsa_agent.crazyflie.settings import RobotSettings, SwarmSettings
 from dtsa_agent.crazyflie.state.conversions import place_text
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_agent.crazyflie.vehicle.reports import Snapshot
@@ -169,7 +168,7 @@ def _geofence(settings: SwarmSettings, there: Sequence[Snapshot]) -> list[Findin
 
 
 def _budget(settings: SwarmSettings) -> list[Finding]:
-    loads = radio_loads(settings.radio_rates())
+    loads = settings.loads
     if not loads:
         return [Finding("budget", OK, "no radios (udp, usb)")]
     bad = WARN if settings.station.force_budget else FAIL

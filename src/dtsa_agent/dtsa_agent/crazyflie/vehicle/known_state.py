@@ -11,7 +11,7 @@ from typing import Any
 from dtsa_agent.crazyflie.links.outbox import Position
 from dtsa_agent.crazyflie.positions.estimates import EstimateWatch, Settling
 from dtsa_agent.crazyflie.positions.motion_capture import EXTPOSE, Room, Seen, Tracker
-from dtsa_agent.crazyflie.settings.config import RobotSettings, StationSettings
+from dtsa_agent.crazyflie.settings import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.state.conversions import Quaternion, Vector, VehicleState
 from dtsa_agent.crazyflie.state.state_machine import IS_FLYING
 

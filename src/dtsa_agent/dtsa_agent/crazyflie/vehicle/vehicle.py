@@ -31,8 +31,8 @@ from typing import Any
 from dtsa_agent.crazyflie.links.link import Link
 from dtsa_agent.crazyflie.motion.controls import GO_TO, SLOW_MPS, TAKEOFF, Controls, end_of_stream
 from dtsa_agent.crazyflie.motion.limits import landing_s, outside_fence, too_short
-from dtsa_agent.crazyflie.settings.config import RobotSettings, StationSettings
-from dtsa_agent.crazyflie.settings.on_board import ENABLE
+from dtsa_agent.crazyflie.onboard import ENABLE
+from dtsa_agent.crazyflie.settings import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.state.conversions import Quaternion, Setpoint, Vector, VehicleState, yaw_of
 from dtsa_agent.crazyflie.state.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
 
@@ -234,8 +234,9 @@ class Vehicle:
                 self.machine.observe(self.last.info)
             if self.state not in (State.ARMED, State.FLYING, State.LANDING):
                 return f"{self.name} is {self.standing}, not armed"
-            if self.last is not None and self.last.battery < self.robot.battery.voltage_critical:
-                return f"{self.name}: battery {self.last.battery:.2f} V"
+            critical = self.robot.battery.voltage_critical
+            if self.state == State.ARMED and self.last is not None and self.last.battery < critical:
+                return f"{self.name}: battery {self.last.battery:.2f} V (voltage_critical is {critical:g} V)"
             if problem := self.known.wrong and f"{self.name}: {self.known.wrong}":
                 return problem
             if self.state == State.ARMED and (problem := self.known.misplaced()):

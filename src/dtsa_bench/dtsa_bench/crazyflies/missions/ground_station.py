@@ -24,7 +24,7 @@ from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.crazyflie.motion.limits import shortest_s
 from dtsa_agent.crazyflie.node.agents_node import STOP_HERE
 from dtsa_agent.crazyflie.node.outputs import EVENTS, EVENTS_QOS
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.ros.common.process.loop import Serving
 from dtsa_agent.stop import StopToken
 

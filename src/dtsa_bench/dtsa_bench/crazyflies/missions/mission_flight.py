@@ -19,7 +19,7 @@ from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.station import check_slotted
 from dtsa_agent.crazyflie.links.link import require_cflib
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import to_parameters

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.crazyflie.safety.rules import SafetySettings
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state.conversions import to_map
 
 PLACE_M = 0.25  # m: a vehicle may stand this far beside its place

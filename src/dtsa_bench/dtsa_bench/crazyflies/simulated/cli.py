@@ -86,7 +86,7 @@ def fleet_config(args: argparse.Namespace) -> FleetConfig:
 def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
     import numpy as np
 
-    from dtsa_agent.crazyflie.settings.config import load_swarm
+    from dtsa_agent.crazyflie.settings import load_swarm
 
     robots = load_swarm(path).robots
     start = np.array([robot.initial_position for robot in robots]).T
