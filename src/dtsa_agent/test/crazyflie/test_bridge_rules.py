@@ -1,4 +1,4 @@
-"""State machine, outbox, safety rules and limits of the bridge: without ROS and without links."""
+"""State machine, mailbox, safety rules and limits of the bridge: without ROS and without links."""
 
 from __future__ import annotations
 
@@ -6,23 +6,25 @@ import dataclasses
 import errno
 import math
 import re
+import time
 from contextlib import nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.crazyflie.links.outbox import Outbox
 from dtsa_agent.crazyflie.motion.controls import LAND, TAKEOFF, Delivery
 from dtsa_agent.crazyflie.motion.limits import check_stream, outside_fence
 from dtsa_agent.crazyflie.safety.rules import ESTIMATE_HOLD_S, Action, SafetyMonitor, SafetySettings, Watched
 from dtsa_agent.crazyflie.settings import StationSettings
 from dtsa_agent.crazyflie.state import conversions
 from dtsa_agent.crazyflie.state import state_machine as sm
-from dtsa_agent.crazyflie.state.conversions import Setpoint
 from dtsa_agent.crazyflie.state.state_machine import State, StateMachine
+
+if TYPE_CHECKING:
+    from dtsa_agent.crazyflie.drivers import Mailbox
 
 
 def machine(*bits: int) -> StateMachine:
@@ -105,28 +107,45 @@ def test_any_sequence_of_events_keeps_to_the_table(events: list[Any]) -> None:
             assert m.state in (State.EMERGENCY, State.LOST)
 
 
-def test_only_the_latest_command_is_sent_and_orders_go_first() -> None:
-    box = Outbox()
-    order = lambda: None  # noqa: E731
-    box.put_setpoint(Setpoint("position", (1,), 0.0))
-    box.put_setpoint(Setpoint("position", (2,), 0.0))
-    assert box.get().arguments == (2,)  # type: ignore[union-attr]
+SETPOINT, POSITION = b"\x7c\x08", b"\x6c\x01"
+GO_TO, LAND_ORDER, NOTIFY, WATCHDOG, STOP = b"\x8c\x0c1", b"\x8c\x08", b"\x7d\x00", b"\x9d\x04", b"\x9d\x03"
+PARAMETER, LOG = b"\x2e\x01", b"\x5d\x05"
+
+
+def taken(box: Mailbox) -> list[bytes]:
+    return [found[1] for found in iter(box.take, None)]
+
+
+def mailbox(*packets: bytes) -> Mailbox:
+    pytest.importorskip("cflib")
+    from dtsa_agent.crazyflie.drivers import Mailbox
+
+    box = Mailbox()
+    for packet in packets:
+        box.put(packet)
+    return box
+
+
+def test_only_the_latest_command_is_sent_orders_go_first_and_the_others_take_turns() -> None:
+    box = mailbox(PARAMETER, SETPOINT + b"1", POSITION, SETPOINT + b"2", WATCHDOG, LOG)
+    assert taken(box) == [WATCHDOG, SETPOINT + b"2", PARAMETER, POSITION, LOG]
     assert box.replaced == 1
-    box.put_background(order)
-    box.put_setpoint(Setpoint("position", (3,), 0.0))
-    assert box.get() is order
-    assert box.get().arguments == (3,)  # type: ignore[union-attr]
+    assert taken(mailbox(SETPOINT, WATCHDOG, WATCHDOG)) == [WATCHDOG, SETPOINT]
 
 
-def test_an_order_ends_the_stream_and_an_urgent_one_empties_the_box() -> None:
-    box = Outbox()
-    urgent = lambda: None  # noqa: E731
-    box.put_setpoint(Setpoint("position", (1,), 0.0))
-    box.put_order(lambda: None)
-    box.put_order(urgent, urgent=True)
-    box.close()
-    assert box.get() is urgent
-    assert box.get() is None
+def test_an_order_ends_the_stream_and_an_emergency_stop_empties_the_box() -> None:
+    assert taken(mailbox(SETPOINT, GO_TO, NOTIFY, GO_TO)) == [GO_TO, NOTIFY, GO_TO]
+    assert taken(mailbox(SETPOINT, GO_TO, PARAMETER, STOP, STOP, STOP)) == [STOP, STOP, STOP]
+
+
+def test_an_order_that_has_waited_for_long_takes_nobody_by_surprise(monkeypatch: pytest.MonkeyPatch) -> None:
+    box = mailbox(GO_TO, STOP)
+    box.put(LAND_ORDER)
+    later = time.monotonic() + 1.1
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    assert taken(box) == [STOP]
+    flood = mailbox(*(GO_TO + bytes((k,)) for k in range(200)))
+    assert 0 < len(taken(flood)) < 50
 
 
 def vehicle(name: str = "cf1", **changes: Any) -> Watched:

@@ -112,7 +112,7 @@ def test_latency_and_rate() -> None:
 
 def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None:
     pytest.importorskip("cflib")
-    from dtsa_agent.crazyflie.links.radio_link import packets_of
+    from cflib.crazyflie.localization import Localization
 
     for send, size, header in (("extpose", 29, 0x61), ("extpos", 12, 0x60)):
         station = StationSettings(positions=PositionSettings(source="pose", send=send))
@@ -121,7 +121,10 @@ def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None
         assert packet is not None
         assert captured is not None
         assert captured.last is not None
-        (data,) = packets_of(SimpleNamespace(platform=None), packet.send) or []
+        sent: list[Any] = []
+        cf = SimpleNamespace(send_packet=sent.append, add_port_callback=lambda *_: None)
+        packet(SimpleNamespace(loc=Localization(cf)))
+        data = bytes((sent[0].header,)) + bytes(sent[0].data)
         assert (len(data) - 1, data[0] & 0xF3, captured.sent) == (size, header, 1)
         soon, late = captured.last.time + 0.2, captured.last.time + 1.0
         assert captured.place(soon) == (1.0, 2.0, 0.5)

@@ -57,7 +57,7 @@ def add_simulated_radio(parser: argparse._ActionsContainer) -> None:
 
 def use_simulated_radio(args: argparse.Namespace) -> None:
     """Tell this process and those that it starts."""
-    from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+    from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 
     if args.simulated_radio is not None:
         os.environ[SIMULATED_RADIO] = str(args.simulated_radio.resolve())
@@ -66,7 +66,7 @@ def use_simulated_radio(args: argparse.Namespace) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the bridge until Ctrl-C."""
     from dtsa_agent.crazyflie.addresses import check_budget
-    from dtsa_agent.crazyflie.links.link import require_cflib
+    from dtsa_agent.crazyflie.link import require_cflib
     from dtsa_agent.crazyflie.settings import load_swarm
 
     use_simulated_radio(args)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from dtsa_agent.crazyflie.links.link import Link
+from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.settings import StationSettings
 from dtsa_agent.crazyflie.state.conversions import Setpoint, Vector, velocity_world
 
@@ -147,7 +147,7 @@ class Controls:
         self._command_time = setpoint.stamp
         self.delivery.cancel()
         self.streaming, self.held, self._brake = True, False, None
-        self._link.outbox.put_setpoint(setpoint)
+        self._link.stream(setpoint)
 
     def fly(self, kind: str, action: Send, duration: float, now: float, *, again: bool = True) -> None:
         """An order to the high-level commander, and only then the end of the stream of setpoints.
@@ -188,7 +188,7 @@ class Controls:
             action()
         else:
             self.streaming = True
-            self._link.outbox.put_setpoint(velocity_world(STANDSTILL, 0.0, now))
+            self._link.stream(velocity_world(STANDSTILL, 0.0, now))
 
     def land(self, height: float, way: float, duration: float, now: float) -> None:
         """Sink straight down to a height (m above the floor), over a way (m), and stop the motors."""
@@ -237,7 +237,7 @@ class Controls:
         self._brake, self._blind = None, (velocity, until)
         self.held, self.streaming = False, True
         self.delivery.cancel()
-        self._link.outbox.put_setpoint(velocity_world(velocity, 0.0, now))
+        self._link.stream(velocity_world(velocity, 0.0, now))
 
     def go_on_blindly(self, in_air: bool, seen: Vector | None, now: float) -> None:
         """The next packet of a stream that needs no place; the motors stop once the vehicle must be down.
@@ -253,4 +253,4 @@ class Controls:
             self._blind, self.streaming = None, False
             self._link.order(end_of_stream)  # with nothing to fly the end of the stream stops the motors
         else:
-            self._link.outbox.put_setpoint(velocity_world(velocity, 0.0, now))
+            self._link.stream(velocity_world(velocity, 0.0, now))

@@ -9,16 +9,15 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_agent.crazyflie.addresses import WATCHDOG_HZ, check_budget, parse_address
-from dtsa_agent.crazyflie.links.emergency_radio import EmergencyRadio
-from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO, require_cflib
+from dtsa_agent.crazyflie.link import SIMULATED_RADIO, require_cflib
 from dtsa_agent.crazyflie.onboard import BoardOrders, key_of, orders, parameters
 from dtsa_agent.crazyflie.safety.rules import Action, SafetyMonitor, Verdict
 from dtsa_agent.crazyflie.settings import SwarmSettings
@@ -93,7 +92,10 @@ class Bridge:
         cache.mkdir(parents=True, exist_ok=True)
         self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state) for r in settings.robots}
         self._prepare_boards()
-        self.emergency = EmergencyRadio([r.uri for r in settings.robots], log)
+        from dtsa_agent.crazyflie.drivers import Radios
+
+        self.radios = Radios(((r.name, r.address) for r in settings.robots), log)
+        self.radios.keep_spare()
         self.monitor = SafetyMonitor(station.safety)
         self._heartbeat: float | None = None
         self._closing = threading.Event()
@@ -130,10 +132,9 @@ class Bridge:
         """Start the agents on board of those that are connected, all at once; why some do not start, or ""."""
         vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
         vehicles = [v for v in vehicles if v.link.connected and v.link.board is not None]
-        problems: SimpleQueue[str] = SimpleQueue()
-        for vehicle in vehicles:
-            vehicle.link.start_agent(lambda text, name=vehicle.name: problems.put(text and f"{name}: {text}"))  # type: ignore[misc]
-        return "; ".join(filter(None, (problems.get() for _ in vehicles)))
+        with ThreadPoolExecutor(max(1, len(vehicles))) as pool:
+            problems = pool.map(lambda vehicle: vehicle.link.start_agent(), vehicles)
+            return "; ".join(f"{v.name}: {text}" for v, text in zip(vehicles, problems, strict=True) if text)
 
     @property
     def connected(self) -> int:
@@ -155,10 +156,10 @@ class Bridge:
         return ""
 
     def _rejoin(self, name: str) -> None:
-        """It is connected again, or not: its agent on board starts anew, in the link's worker."""
-        vehicle = self.vehicles[name]
-        if vehicle.link.connected and vehicle.link.board is not None:
-            vehicle.link.start_agent(lambda text: self._log("error", f"{name}: {text}") if text else None)
+        """It is connected again, or not: its agent on board starts anew."""
+        link = self.vehicles[name].link
+        if link.connected and link.board is not None and (problem := link.start_agent()):
+            self._log("error", f"{name}: {problem}")
 
     # -- orders to several ------------------------------------------------------------------------------------------
     def each(self, names: Iterable[str], order: Callable[[Vehicle], str | None]) -> tuple[bool, str]:
@@ -201,7 +202,7 @@ class Bridge:
     def stop_all(self, reason: str) -> None:
         """Emergency stop of all."""
         self._log("error", f"EMERGENCY STOP of all: {reason}")
-        self.emergency.stop_all()
+        self.radios.stop_all()
         for vehicle in self.vehicles.values():
             vehicle.stop(reason)
 
@@ -296,11 +297,7 @@ class Bridge:
                 "info",
                 f"{', '.join(guarded)}: locked by the emergency watchdog within 1 s: restart before flying again",
             )
-        for vehicle in self.vehicles.values():
-            vehicle.link.close()
-        deadline = time.monotonic() + 5.0
-        for vehicle in self.vehicles.values():
-            if not vehicle.link.join(max(0.0, deadline - time.monotonic())):
-                self._log("warn", f"{vehicle.name}: the link does not close")
-        self.emergency.close()
+        with ThreadPoolExecutor(len(self.vehicles)) as pool:
+            list(pool.map(lambda vehicle: vehicle.link.close(), self.vehicles.values()))
+        self.radios.close()
         self._ownership.release()

@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from dtsa_agent.crazyflie.links.outbox import Position
 from dtsa_agent.crazyflie.positions.estimates import EstimateWatch, Settling
 from dtsa_agent.crazyflie.positions.motion_capture import EXTPOSE, Room, Seen, Tracker
 from dtsa_agent.crazyflie.settings import RobotSettings, StationSettings
@@ -77,7 +76,7 @@ class KnownState:
         return min(1.0, recent / (self._robot.log_rate_hz * QUALITY_WINDOW_S))
 
     # -- motion capture ---------------------------------------------------------------------------------------------
-    def see(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> Position | None:
+    def see(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> Callable[[Any], None] | None:
         """A pose from motion capture (see `Tracker.offer`); what the Crazyflie is to be told, None: nothing."""
         tracker, now = self.tracker, time.monotonic()
         if tracker is None:
@@ -89,7 +88,7 @@ class KnownState:
                 self._log("warn", f"{self._robot.name}: a pose of motion capture is refused: {problem}")
             return None
         assert tracker.last is not None
-        return Position(_packet(tracker, tracker.last)) if tracker.due(now) else None
+        return _packet(tracker, tracker.last) if tracker.due(now) else None
 
     def seen_at(self, now: float) -> Vector | None:
         """Where motion capture sees it (m, world); None: not at all, or not any more."""

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from dtsa_agent.crazyflie.links.link import Link
+from dtsa_agent.crazyflie.link import Link
 
 FLOATS = frozenset({"float", "FP16", "double"})
 
@@ -37,7 +37,7 @@ class Parameter:
 
 
 class Onboard:
-    """Parameters of one Crazyflie; they are set through its link's worker, behind its orders."""
+    """Parameters of one Crazyflie."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -71,8 +71,8 @@ class Onboard:
 
         def send(cf: Any) -> None:
             parameters = cf.param
-            if parameters.is_updated:  # else cflib would keep the worker waiting, and all orders with it
+            if parameters.is_updated:  # else cflib would keep this thread waiting
                 with contextlib.suppress(KeyError, AttributeError):  # the link has just ended
                     parameters.set_value(name, value)
 
-        self._link.order(send, background=True)
+        self._link.order(send)

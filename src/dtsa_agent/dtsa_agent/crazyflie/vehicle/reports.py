@@ -62,8 +62,8 @@ def snapshot(vehicle: Vehicle, now: float) -> Snapshot:
     """Everything for the status (now: s, monotonic)."""
     with vehicle.lock:
         link, quality, tracker = vehicle.link, vehicle.known.logged(now), vehicle.known.tracker
-        if link.radio_quality is not None:
-            quality = min(quality, link.radio_quality)
+        if link.quality is not None:
+            quality = min(quality, link.quality)
         delays = sorted(link.latencies.copy())
         sends = [t for t in link.send_times.copy() if now - t <= QUALITY_WINDOW_S]
         return Snapshot(
@@ -79,7 +79,7 @@ def snapshot(vehicle: Vehicle, now: float) -> Snapshot:
             link.sent,
             link.received,
             vehicle.refused,
-            link.outbox.replaced,
+            link.replaced,
             delays[int(0.99 * (len(delays) - 1))] if delays else 0.0,
             len(sends) / QUALITY_WINDOW_S,
             None if tracker is None else tracker.numbers(now),

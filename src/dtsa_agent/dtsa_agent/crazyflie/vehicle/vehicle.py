@@ -28,7 +28,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.crazyflie.links.link import Link
+from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.motion.controls import GO_TO, SLOW_MPS, TAKEOFF, Controls, end_of_stream
 from dtsa_agent.crazyflie.motion.limits import landing_s, outside_fence, too_short
 from dtsa_agent.crazyflie.onboard import ENABLE
@@ -113,7 +113,7 @@ class Vehicle:
         """The end of a gap: the orders that were given in it may have been lost."""
         self.controls.end_repeats()
         if self.guarded:  # its watchdog has not much time left
-            self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
+            self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
         if self.state != State.LANDING:
             return
         drifts = math.hypot(*state.velocity[:2]) > SLOW_MPS
@@ -141,18 +141,19 @@ class Vehicle:
         with self.lock:
             packet = self.known.see(position, orientation, frame, stamp)
         if packet is not None:
-            self.link.outbox.put_position(packet)
+            self.link.send_position(packet)
 
     # -- connection -------------------------------------------------------------------------------------------------
     def connect(self, done: Callable[[], None]) -> None:
-        """Connect in the background; `done` is called when it has worked out or not."""
+        """Connect in a thread of its own; `done` is called when it has worked out or not."""
         with self.lock:
             self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
             self._overruled = self._paused = self.guarded = False
             self.controls.reset()
 
-        def finished(reason: str) -> None:
+        def run() -> None:
             try:
+                reason = self.link.connect()
                 with self.lock:
                     if reason:
                         self._log("error", f"{self.name}: no connection: {reason}")
@@ -164,7 +165,7 @@ class Vehicle:
             finally:
                 done()
 
-        self.link.connect(finished)
+        threading.Thread(target=run, name=f"{self.name}-connect", daemon=True).start()
 
     @property
     def last(self) -> VehicleState | None:
@@ -388,7 +389,7 @@ class Vehicle:
                 for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
                     cf.supervisor.send_emergency_stop()
 
-            self.link.order(run, urgent=True)
+            self.link.order(run)
             self.machine.emergency(self.action)
 
     def notify_setpoints_stop(self, remain_ms: int) -> str:
@@ -437,4 +438,4 @@ class Vehicle:
             self.guarded |= watchdog and self.state in WATCHED_OVER
             self.link.guarded = self.guarded
             if self.guarded and self.state not in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY):
-                self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
+                self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())

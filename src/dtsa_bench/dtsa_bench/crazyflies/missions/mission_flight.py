@@ -18,7 +18,7 @@ from rclpy.node import Node
 from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.station import check_slotted
-from dtsa_agent.crazyflie.links.link import require_cflib
+from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names

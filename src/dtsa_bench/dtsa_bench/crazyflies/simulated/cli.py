@@ -65,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument("--rate", type=float, help="drop: share of the datagrams that is lost")
     faults.add_argument("--direction", choices=("up", "down", "both"), help="drop: up is from the host")
     faults.add_argument("--distance", type=float, help="estimate_jump: m")
+    faults.add_argument("--dongle", type=int, help="unplug: number of the dongle")
     faults.add_argument("--voltage", type=float, help="battery: V")
     faults.add_argument("--seconds", type=float, help="heals by itself after that long")
 

@@ -14,7 +14,7 @@ import pytest
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.addresses import RadioUser, check_budget, parse_address, radio_loads
-from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.crazyflie.node.bridge import Ownership
 from dtsa_agent.crazyflie.settings import load_swarm, parse_swarm
 
@@ -251,7 +251,7 @@ def test_cflib_shows_no_warnings_of_other_packages() -> None:
     """Its import turns all DeprecationWarnings on; a mission's error then stood below those of its dependencies."""
     pytest.importorskip("cflib")
     program = (
-        "import warnings; from dtsa_agent.crazyflie.links.link import require_cflib; require_cflib(); "
+        "import warnings; from dtsa_agent.crazyflie.link import require_cflib; require_cflib(); "
         "warnings.warn_explicit('old', DeprecationWarning, 'elsewhere.py', 1, module='elsewhere')"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
