@@ -23,10 +23,11 @@ from typing import Any
 from dtsa_agent.core.errors import ConfigError
 
 from .addresses import LinkError
+from .commands import Setpoint
 from .onboard import BoardOrders
-from .positions.estimates import Settling
+from .positions import Settling
 from .settings import RobotSettings
-from .state.conversions import LOG_VARIABLES, Setpoint, Vector, VehicleState, decode_log
+from .state import LOG_VARIABLES, Vector, VehicleState, decode_log
 
 SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Crazyradios, for simulation only
 FIRST_ANSWER_S = 2.0  # over the air nothing else tells that nobody is there
@@ -170,6 +171,18 @@ class Link:
         """Give an order, if there is a connection. Emergency stops go before everything that waits."""
         if (cf := self.crazyflie) is not None:
             self._give(cf, action)
+
+    @property
+    def can_set(self) -> bool:
+        """Whether parameters can be set now: it is connected, and their values are known."""
+        cf = self.crazyflie
+        return cf is not None and bool(cf.param.is_updated)
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set a parameter that exists to a value that it can have; does not wait."""
+        if self.can_set:  # else cflib would keep this thread waiting
+            with contextlib.suppress(KeyError, AttributeError):  # the link has just ended
+                self._cf.param.set_value(name, value)
 
     def send_position(self, send: Send) -> None:
         """Send where motion capture sees it, while it connects, too: the estimator settles by that."""

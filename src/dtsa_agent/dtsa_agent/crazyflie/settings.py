@@ -24,12 +24,12 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting, settings_of
 from dtsa_agent.core.settings.scenario import make_scenario
-from dtsa_agent.crazyflie.positions.motion_capture import NONE, PositionSettings
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
-from dtsa_agent.crazyflie.state.conversions import Vector
 
 from .addresses import Address, RadioLoad, RadioUser, check_distinct, parse_address, radio_loads
 from .onboard import OnBoardSettings, check_on_board
+from .positions import NONE, PositionSettings
+from .safety import SafetySettings
+from .state import Vector
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 NUMBER = re.compile(r"\d+$")

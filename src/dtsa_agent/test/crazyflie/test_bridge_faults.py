@@ -19,8 +19,9 @@ pytest.importorskip("cflib")
 from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, settings
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.state.state_machine import State
-from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
+from dtsa_agent.crazyflie.node.parameters import read_parameters
+from dtsa_agent.crazyflie.state import State
+from dtsa_agent.crazyflie.vehicle import Vehicle
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
@@ -205,7 +206,7 @@ def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_contro
 
 
 def check_parameters(one: Vehicle, two: Vehicle) -> None:
-    known = one.onboard.parameters()
+    known = read_parameters(one.link)
     assert (known["ring.effect"].value, known["hlCommander.vland"].value) == (6, 0.5)
     for name, value, problem in (
         ("ring.effect", 7, ""),
@@ -216,9 +217,9 @@ def check_parameters(one: Vehicle, two: Vehicle) -> None:
         ("firmware.modified", 1, "firmware.modified is read-only"),
     ):
         assert known[name].problem(value) == problem
-    one.onboard.set_parameter("ring.effect", 7)
-    wait_for(lambda: one.onboard.parameters()["ring.effect"].value == 7)
-    assert two.onboard.parameters()["ring.effect"].value == 6
+    one.link.set_parameter("ring.effect", 7)
+    wait_for(lambda: read_parameters(one.link)["ring.effect"].value == 7)
+    assert read_parameters(two.link)["ring.effect"].value == 6
 
 
 @pytest.mark.realtime

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import math
 import re
@@ -15,13 +14,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.crazyflie.motion.controls import LAND, TAKEOFF, Delivery
-from dtsa_agent.crazyflie.motion.limits import check_stream, outside_fence
-from dtsa_agent.crazyflie.safety.rules import ESTIMATE_HOLD_S, Action, SafetyMonitor, SafetySettings, Watched
+from dtsa_agent.crazyflie import commands
+from dtsa_agent.crazyflie import state as sm
+from dtsa_agent.crazyflie.commands import check_stream
+from dtsa_agent.crazyflie.controls import LAND, TAKEOFF, Delivery
+from dtsa_agent.crazyflie.safety import (
+    ESTIMATE_HOLD_S,
+    Action,
+    SafetyMonitor,
+    SafetySettings,
+    Watched,
+    outside_fence,
+)
 from dtsa_agent.crazyflie.settings import StationSettings
-from dtsa_agent.crazyflie.state import conversions
-from dtsa_agent.crazyflie.state import state_machine as sm
-from dtsa_agent.crazyflie.state.state_machine import State, StateMachine
+from dtsa_agent.crazyflie.state import State, StateMachine
 
 if TYPE_CHECKING:
     from dtsa_agent.crazyflie.drivers import Mailbox
@@ -253,33 +259,34 @@ def test_a_rule_speaks_again_after_it_had_ceased() -> None:
 
 
 def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused() -> None:
-    station = StationSettings()
-    assert outside_fence((1.5, 0.0, 1.0), station) == ""
-    assert outside_fence((1.95, 0.0, 0.95), station) == "(1.95, 0.00, 0.00) is 0.45 m outside the geofence in x"
-    assert outside_fence((0.0, 0.0, 2.5), station).endswith("0.60 m outside the geofence in z")
+    station, origin = StationSettings(), (0.0, 0.0, 0.95)
+    fence = station.safety
+    limits = fence, origin, station.max_stream_mps
+    assert outside_fence((1.5, 0.0, 1.0), fence, origin) == ""
+    assert outside_fence((1.95, 0.0, 0.95), fence, origin) == "(1.95, 0.00, 0.00) is 0.45 m outside the geofence in x"
+    assert outside_fence((0.0, 0.0, 2.5), fence, origin).endswith("0.60 m outside the geofence in z")
     for axis in range(3):
         for speed, allowed in ((station.max_stream_mps, True), (station.max_stream_mps + 0.01, False)):
             velocity = tuple(speed if k == axis else 0.0 for k in range(3))
-            command = conversions.velocity_world(velocity, 0.0, 0.0)  # type: ignore[arg-type]
+            command = commands.velocity_world(velocity, 0.0, 0.0)  # type: ignore[arg-type]
             with nullcontext() if allowed else pytest.raises(ValueError, match="m/s is refused"):
-                check_stream(command, station)
-    open_air = dataclasses.replace(station, safety=SafetySettings(geofence=False))
-    assert outside_fence((9.0, 0.0, 1.0), open_air) == ""
+                check_stream(command, *limits)
+    assert outside_fence((9.0, 0.0, 1.0), SafetySettings(geofence=False), origin) == ""
     still = (0.0, 0.0, 0.0)
     for setpoint in (
-        conversions.velocity_world((1.5, 0.0, 0.0), 0.0, 0.0),
-        conversions.position((1.0, 2.0, 1.0), 0.0, 0.0),
-        conversions.full_state((1.0, 0.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0),
+        commands.velocity_world((1.5, 0.0, 0.0), 0.0, 0.0),
+        commands.position((1.0, 2.0, 1.0), 0.0, 0.0),
+        commands.full_state((1.0, 0.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0),
     ):
-        check_stream(setpoint, station)
+        check_stream(setpoint, *limits)
     for setpoint, words in (
-        (conversions.velocity_world((50.0, 0.0, 0.0), 0.0, 0.0), "50.00 m/s is refused (station.max_stream_mps is 3)"),
-        (conversions.position((1.95, 0.0, 1.0), 0.0, 0.0), "0.45 m outside the geofence in x"),
-        (conversions.full_state((0.0, 3.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "geofence in y"),
-        (conversions.full_state((0.0, 0.0, 1.0), (0.0, 9.0, 0.0), still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "9.00 m/s"),
+        (commands.velocity_world((50.0, 0.0, 0.0), 0.0, 0.0), "50.00 m/s is refused (station.max_stream_mps is 3)"),
+        (commands.position((1.95, 0.0, 1.0), 0.0, 0.0), "0.45 m outside the geofence in x"),
+        (commands.full_state((0.0, 3.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "geofence in y"),
+        (commands.full_state((0.0, 0.0, 1.0), (0.0, 9.0, 0.0), still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "9.00 m/s"),
     ):
         with pytest.raises(ValueError, match=re.escape(words)):
-            check_stream(setpoint, station)
+            check_stream(setpoint, *limits)
 
 
 def test_a_take_off_is_ordered_again_while_the_supervisor_lets_no_motor_run() -> None:

@@ -14,8 +14,8 @@ import pytest
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.addresses import RadioUser, check_budget, parse_address, radio_loads
+from dtsa_agent.crazyflie.bridge import Ownership
 from dtsa_agent.crazyflie.link import SIMULATED_RADIO
-from dtsa_agent.crazyflie.node.bridge import Ownership
 from dtsa_agent.crazyflie.settings import load_swarm, parse_swarm
 
 RADIO = "radio://0/80/2M/E7E7E7E701"

@@ -29,13 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_simulated_radio(parser)
     parser.add_argument(
-        "--interfaces",
-        choices=("dtsa", "crazyswarm2"),
-        default="dtsa",
-        help="crazyswarm2: the node crazyflie_server with Crazyswarm2's messages, names and units, for its programs; "
-        "needs crazyflie_interfaces in the workspace (default %(default)s)",
-    )
-    parser.add_argument(
         "--check",
         nargs="?",
         const=ALL,
@@ -78,15 +71,14 @@ def run(args: argparse.Namespace) -> int:
     require_cflib()
     with ExitStack() as stack:
         config = simulated(args.config, stack) if args.backend == "sim" else args.config
-        return run_bridge(config, interfaces=args.interfaces, check=args.check == ALL)
+        return run_bridge(config, check=args.check == ALL)
 
 
-def run_bridge(config: Path, *, interfaces: str = "dtsa", check: bool = False) -> int:
+def run_bridge(config: Path, *, check: bool = False) -> int:
     """The bridge in this process; `check`: only connect, and say what a flight would lack."""
     from dtsa_agent.crazyflie.node import bridge_node
 
     arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config.resolve()}"]
-    arguments += ["-p", f"interfaces:={interfaces}"] if interfaces != "dtsa" else []
     if check:
         # Too many for a radio is a line of the list here, not the end.
         arguments += ["--log-level", "error"]

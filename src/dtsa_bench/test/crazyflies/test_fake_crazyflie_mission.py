@@ -37,7 +37,7 @@ from waiting import wait_for
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.link import require_cflib
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import mission_problem
 from dtsa_bench.crazyflies.missions.mission_flight import MissionWatch

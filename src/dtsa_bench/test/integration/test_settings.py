@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, nested, setting, settings_of
 from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, AvoiderParams, FlightModel, VehicleParams
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_bench.crazyflies.simulated import FleetConfig
 from dtsa_bench.experiments import sweep as spec

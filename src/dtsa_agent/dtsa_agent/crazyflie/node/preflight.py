@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from dtsa_agent.crazyflie.motion.limits import outside_fence
+from dtsa_agent.crazyflie.safety import outside_fence
 from dtsa_agent.crazyflie.settings import RobotSettings, SwarmSettings
-from dtsa_agent.crazyflie.state.conversions import place_text
-from dtsa_agent.crazyflie.state.state_machine import State
-from dtsa_agent.crazyflie.vehicle.reports import Snapshot
+from dtsa_agent.crazyflie.state import State, place_text
+from dtsa_agent.crazyflie.vehicle import OFF, Snapshot
+
+if TYPE_CHECKING:
+    from dtsa_agent.crazyflie.drivers import Radios  # importing it wants cflib
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 FAR_M = 0.25  # from its initial_position
@@ -36,6 +40,7 @@ def preflight(
     settings: SwarmSettings,
     snapshots: Sequence[Snapshot],
     firmware: Mapping[str, tuple[int, str]],
+    radios: Radios,
     priority_problem: str,
 ) -> list[Finding]:
     """The whole list.
@@ -45,15 +50,16 @@ def preflight(
     :param priority_problem: why there is no real-time priority; empty: there is.
     """
     robots = {robot.name: robot for robot in settings.robots}
-    there = [s for s in snapshots if s.state not in (State.DISCONNECTED, State.CONNECTING) and s.vehicle is not None]
+    now = time.monotonic()
+    there = [s for s in snapshots if s.state not in OFF and s.vehicle is not None]
     return [
         *_links(snapshots),
         *_firmware(firmware),
         *_batteries(there, robots),
-        *_positions(there, robots),
-        *_clocks(settings, there),
+        *_positions(there, robots, now),
+        *_clocks(settings, there, now),
         *_geofence(settings, there),
-        *_budget(settings),
+        *_radios(settings, radios),
         _priority(settings, priority_problem),
     ]
 
@@ -108,7 +114,7 @@ def _batteries(there: Sequence[Snapshot], robots: Mapping[str, RobotSettings]) -
     return _all_well("batteries", found, f"{min(volts):.2f} to {max(volts):.2f} V")
 
 
-def _positions(there: Sequence[Snapshot], robots: Mapping[str, RobotSettings]) -> list[Finding]:
+def _positions(there: Sequence[Snapshot], robots: Mapping[str, RobotSettings], now: float) -> list[Finding]:
     found, away = [], []
     for s in there:
         assert s.vehicle is not None
@@ -120,27 +126,26 @@ def _positions(there: Sequence[Snapshot], robots: Mapping[str, RobotSettings]) -
         elif distance > FAR_M:
             text = f"{s.name}: at {where} in the world, {distance:.2f} m from its initial_position"
             found.append(Finding("positions", WARN, text))
-        if s.positions is not None and s.positions.rate == 0.0:
-            found.append(
-                Finding("positions", FAIL, f"{s.name}: not seen by motion capture {s.positions.reason}".rstrip())
-            )
+        if s.tracker is not None and s.tracker.rate(now) == 0.0:
+            text = f"{s.name}: not seen by motion capture {s.tracker.reason}".rstrip()
+            found.append(Finding("positions", FAIL, text))
     if not away:
         return [Finding("positions", FAIL, "unknown: nobody is connected")]
     text = f"at most {max(away):.2f} m from the initial positions"
-    rates = [s.positions.rate for s in there if s.positions is not None]
+    rates = [s.tracker.rate(now) for s in there if s.tracker is not None]
     if rates:
         text += f"; motion capture at {min(rates):.0f} to {max(rates):.0f} Hz"
     return _all_well("positions", found, text)
 
 
-def _clocks(settings: SwarmSettings, there: Sequence[Snapshot]) -> list[Finding]:
+def _clocks(settings: SwarmSettings, there: Sequence[Snapshot], now: float) -> list[Finding]:
     if not settings.station.positions.on:
         return [Finding("clocks", OK, "one clock, the station's: there is no motion capture")]
     found, medians = [], []
     for s in there:
-        if s.positions is None or s.positions.rate == 0.0:
+        if s.tracker is None or s.tracker.rate(now) == 0.0:
             continue
-        median = s.positions.latency_p50
+        median = s.tracker.latency(0.5)
         medians.append(median)
         if not AHEAD_S <= median <= LATE_S:
             text = (
@@ -161,18 +166,25 @@ def _geofence(settings: SwarmSettings, there: Sequence[Snapshot]) -> list[Findin
     found = []
     for s in there:
         assert s.vehicle is not None
-        if problem := outside_fence(s.vehicle.position, settings.station):
+        if problem := outside_fence(s.vehicle.position, fence, settings.station.room_origin_in_world):
             found.append(Finding("geofence", FAIL, f"{s.name}: {problem}"))
     low, high = ("(" + ", ".join(f"{p:g}" for p in c) + ")" for c in (fence.geofence_min, fence.geofence_max))
     return _all_well("geofence", found, f"{low} to {high} in map; all stand inside")
 
 
-def _budget(settings: SwarmSettings) -> list[Finding]:
+def _radios(settings: SwarmSettings, radios: Radios) -> list[Finding]:
     loads = settings.loads
     if not loads:
         return [Finding("budget", OK, "no radios (udp, usb)")]
     bad = WARN if settings.station.force_budget else FAIL
-    return [Finding("budget", OK if load.fits else bad, str(load)) for load in loads]
+    found = [Finding("budget", OK if load.fits else bad, str(load)) for load in loads]
+    if radios.spare is None:
+        found.append(Finding("emergency", WARN, "no radio is left for emergency stops: plug in one more"))
+    else:
+        found.append(Finding("emergency", OK, f"radio {radios.spare.radio} is kept for emergency stops"))
+    for name in radios.foreign:
+        found.append(Finding("budget", WARN, f"radio {name}: packets are repeated: somebody else sends on the channel"))
+    return found
 
 
 def _priority(settings: SwarmSettings, problem: str) -> Finding:

@@ -222,8 +222,10 @@ def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, dir
     parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     rate = max(robot.command_rate_hz for robot in settings.robots)
     ids = list(range(1, run.swarm.agents + 1))
+    origin = list(settings.station.room_origin_in_world)
     agents.start("agents", ids, "dtsa_agent.crazyflie.node.agents_node",
                  ["--ros-args", "--params-file", str(parameters), "-p", f"command_hz:={float(rate)}",
+                  "-p", f"vehicles:={' '.join(robot.name for robot in settings.robots)}", "-p", f"origin:={origin}",
                   "-p", f"priority:={settings.station.priority}",
                   "--disable-external-lib-logs", "--disable-rosout-logs"])  # fmt: skip
 

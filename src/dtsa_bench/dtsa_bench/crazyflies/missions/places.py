@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.settings import SwarmSettings
-from dtsa_agent.crazyflie.state.conversions import to_map
+from dtsa_agent.crazyflie.state import to_map
 
 PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
 APART_M = 0.35  # m: closer than this to each other nobody takes off or flies to its start

@@ -12,7 +12,8 @@
 | distance | two flying vehicles too close | land both |
 | supervisor | tumbled, crashed, locked | stop sending to it |
 
-A rule speaks once when it begins to apply, and again only after it has ceased to.
+A rule speaks once when it begins to apply, and again only after it has ceased to. What would lead outside is refused
+before it is flown (`outside_fence`).
 """
 
 from __future__ import annotations
@@ -24,10 +25,14 @@ from dataclasses import dataclass
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
-from dtsa_agent.crazyflie.state.conversions import Vector, outside_by
-from dtsa_agent.crazyflie.state.state_machine import IN_AIR, State
+
+from .state import IN_AIR, State, Vector, VehicleState, outside_by, place_text, to_map
 
 ESTIMATE_HOLD_S = 1.0  # a vehicle whose estimate is wrong stands still that long, then it sinks
+ACCELERATION = 1.5  # m/s per s of silence that velocities may have changed between two packets
+STUCK_M = 0.15  # a place that does not change has lost its velocity after so much of it
+STANDING_M = 0.15  # so low it may stand, or be about to: there is nothing to change
+APART_S = 0.3  # s, how long estimate and motion capture may differ before it counts
 
 
 class Action(enum.Enum):
@@ -101,6 +106,20 @@ class SafetySettings(Settings):
         for axis, low, high in zip("xyz", self.geofence_min, self.geofence_max, strict=True):
             if low >= high:
                 raise ConfigError("geofence_min", list(self.geofence_min), f"below geofence_max in {axis}")
+
+
+def outside_fence(place: Vector, safety: SafetySettings, origin: Vector) -> str:
+    """How a place (m, world) is outside the geofence; empty if it is not, or if there is no fence.
+
+    :param origin: m, where the world sees the origin of `map`.
+    """
+    if not safety.geofence:
+        return ""
+    here = to_map(place, origin)
+    for away, axis in outside_by(here, safety.geofence_min, safety.geofence_max):
+        if away > safety.geofence_tolerance_m:
+            return f"{place_text(here)} is {away:.2f} m outside the geofence in {axis}"
+    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,3 +274,68 @@ def _waiting(v: Watched, age: float | None, hold_s: float, land_s: float, rule: 
     if age > land_s:
         verdicts.append(Verdict(v.name, Action.LAND, rule, reason))
     return verdicts
+
+
+@dataclass(slots=True)
+class EstimateWatch:
+    """Notices in flight when an estimate jumps, stands still, or is not where motion capture sees the vehicle.
+
+    What was wrong once stays wrong until the vehicle stands.
+
+    :param jump_m: m from one packet to the next that the velocity does not explain; 0: never.
+    :param freeze_s: s without any change; 0: never.
+    :param error_m: m from where motion capture sees it; 0: never.
+    """
+
+    jump_m: float
+    freeze_s: float
+    error_m: float
+    wrong: str = ""  # what is wrong; empty: nothing
+    since: float = 0.0  # s, monotonic, from when on
+    _last: tuple[VehicleState, float] | None = None
+    _moved: float = 0.0  # s, monotonic, when it changed last
+    _unmoved_m: float = 0.0  # m, way by its velocity since the place changed last
+    _agreed: float = 0.0  # s, monotonic, when estimate and motion capture agreed last
+
+    def update(self, state: VehicleState, now: float, seen: Vector | None, *, flying: bool) -> bool:
+        """Take in a log packet; True when something is wrong that was not before.
+
+        :param seen: m, world: where motion capture sees it now; None: not at all.
+        """
+        last, self._last = self._last, (state, now)
+        if not flying or last is None:
+            self.wrong = ""
+            self._moved = self._agreed = now
+            self._unmoved_m = 0.0
+            return False
+        before = last[0]
+        if state.position != before.position or state.position[2] < STANDING_M:
+            self._moved, self._unmoved_m = now, 0.0
+        else:
+            self._unmoved_m += math.hypot(*state.velocity) * (now - last[1])
+            if state.velocity != before.velocity or state.orientation != before.orientation:
+                self._moved = now  # the place alone may stay the same, to the millimetre, unless its velocity is large
+        if seen is None or math.dist(seen, state.position) <= self.error_m:
+            self._agreed = now
+        if self.wrong:
+            return False
+        self.wrong = self._what_is_wrong(state, last, now, seen)
+        self.since = now
+        return bool(self.wrong)
+
+    def _what_is_wrong(
+        self, state: VehicleState, last: tuple[VehicleState, float], now: float, seen: Vector | None
+    ) -> str:
+        before, dt = last[0], now - last[1]
+        follows = [p + v * dt for p, v in zip(before.position, before.velocity, strict=True)]
+        jump = math.dist(state.position, follows)
+        if self.jump_m and jump > self.jump_m + ACCELERATION * dt:
+            return f"the estimate jumps by {jump:.2f} m within {dt:.2f} s"
+        if self.freeze_s and now - self._moved > self.freeze_s:
+            return f"the estimate has not changed for {now - self._moved:.2f} s"
+        if self.freeze_s and self._unmoved_m > STUCK_M:
+            return f"the estimated place has not changed, though it moved by {self._unmoved_m:.2f} m by its velocity"
+        if self.error_m and seen is not None and now - self._agreed > APART_S:
+            away = math.dist(seen, state.position)
+            return f"the estimate is {away:.2f} m from where motion capture sees it"
+        return ""

@@ -16,15 +16,14 @@ from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.scenario import make_scenario
-from dtsa_agent.crazyflie.addresses import WATCHDOG_HZ, check_budget, parse_address
-from dtsa_agent.crazyflie.link import SIMULATED_RADIO, require_cflib
-from dtsa_agent.crazyflie.onboard import BoardOrders, key_of, orders, parameters
-from dtsa_agent.crazyflie.safety.rules import Action, SafetyMonitor, Verdict
-from dtsa_agent.crazyflie.settings import SwarmSettings
-from dtsa_agent.crazyflie.state.conversions import VehicleState
-from dtsa_agent.crazyflie.state.state_machine import State
-from dtsa_agent.crazyflie.vehicle.reports import Snapshot, snapshot, watched
-from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
+
+from .addresses import WATCHDOG_HZ, check_budget, parse_address
+from .link import SIMULATED_RADIO, require_cflib
+from .onboard import BoardOrders, key_of, orders, parameters
+from .safety import Action, SafetyMonitor, Verdict
+from .settings import SwarmSettings
+from .state import State, VehicleState
+from .vehicle import OFF, Snapshot, Vehicle
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
@@ -65,7 +64,6 @@ class Bridge:
     """The swarm. Its own thread applies the safety rules 50 times a second.
 
     :param on_state: called with a vehicle and each new state of it, in a thread of the link's.
-    :param on_event: called with a vehicle's name (empty: all), the rule and the reason when a safety rule acts.
     :raises ConfigError: cflib is missing, or the radios cannot carry the swarm.
     """
 
@@ -74,7 +72,6 @@ class Bridge:
         settings: SwarmSettings,
         log: Callable[[str, str], None],
         on_state: Callable[[Vehicle, VehicleState], None] | None = None,
-        on_event: Callable[[str, str, str], None] | None = None,
     ) -> None:
         self.settings = settings
         station = settings.station
@@ -84,7 +81,6 @@ class Bridge:
         require_cflib()
         self._ownership = Ownership((robot.name, robot.uri) for robot in settings.robots)
         self._log = log
-        self._on_event = on_event
         cache = Path(
             station.toc_cache or Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dtsa/crazyflie"
         )
@@ -92,7 +88,7 @@ class Bridge:
         cache.mkdir(parents=True, exist_ok=True)
         self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state) for r in settings.robots}
         self._prepare_boards()
-        from dtsa_agent.crazyflie.drivers import Radios
+        from .drivers import Radios  # needs cflib
 
         self.radios = Radios(((r.name, r.address) for r in settings.robots), log)
         self.radios.keep_spare()
@@ -116,7 +112,7 @@ class Bridge:
         for _ in vehicles:
             while not (waiting.acquire(timeout=0.1) or stop()):
                 pass
-        return [v.name for v in vehicles if v.state in (State.DISCONNECTED, State.CONNECTING)]
+        return [v.name for v in vehicles if v.state in OFF]
 
     def _prepare_boards(self) -> None:
         """What agents on board are told, where they steer."""
@@ -139,7 +135,7 @@ class Bridge:
     @property
     def connected(self) -> int:
         """Number of connected Crazyflies."""
-        return sum(v.state not in (State.DISCONNECTED, State.CONNECTING) for v in self.vehicles.values())
+        return sum(v.state not in OFF for v in self.vehicles.values())
 
     def reconnect(self, name: str) -> str:
         """Connect one again that is lost, disconnected or stopped; why not, or an empty text. Does not wait."""
@@ -224,7 +220,7 @@ class Bridge:
             last = now
             vehicles = self.vehicles.values()
             age = None if self._heartbeat is None else now - self._heartbeat
-            for verdict in self.monitor.check(now, [watched(v, now) for v in vehicles], age):
+            for verdict in self.monitor.check(now, [v.watched(now) for v in vehicles], age):
                 self._act(verdict, now)
             for vehicle in vehicles:
                 vehicle.tick(now)
@@ -250,14 +246,12 @@ class Bridge:
                 vehicle.lose(verdict.reason, now)
             elif verdict.action is Action.STOP:
                 vehicle.stop(verdict.reason)
-        if self._on_event is not None:
-            self._on_event(verdict.name, verdict.rule, verdict.reason)
 
     # -- the end ----------------------------------------------------------------------------------------------------
     def snapshots(self) -> list[Snapshot]:
         """State of all."""
         now = time.monotonic()
-        return [snapshot(v, now) for v in self.vehicles.values()]
+        return [v.snapshot(now) for v in self.vehicles.values()]
 
     def in_air(self, now: float) -> list[str]:
         """Names of those whose link must not be closed now."""
