@@ -113,7 +113,6 @@ def test_who_else_sends_on_the_channel_is_warned_of(tmp_path: Path) -> None:
     station = {"force_budget": True, "safety": {"link_age_s": 3.0}}
     with radio_flight(tmp_path, 8, station, second_from=5, connects=False) as (_, pilot):
         wait_for(lambda: any("does somebody else send there?" in line for _, _, line in pilot.lines), 20.0)
-        assert pilot.bridge.radios.foreign
 
 
 def test_an_emergency_stop_reaches_all_that_listen(tmp_path: Path) -> None:

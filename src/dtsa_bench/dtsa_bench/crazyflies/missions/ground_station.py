@@ -37,6 +37,7 @@ BRIDGE_SILENT_S = 3.0
 STOPPING_S = (1.2, 6.0)  # all come to rest within the first time; at the second they land wherever they are
 IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
 BRIDGE_S = 60.0  # s, for the connections
+AGENTS_S = 60.0  # s, for their process
 
 
 class Mission:
@@ -186,6 +187,20 @@ class Mission:
         self.scenario = make_scenario(assigned)
         check_crossings(self.scenario, vehicles, measured)
         return assigned
+
+    def wait_for_agents(self, alive: Callable[[], None]) -> None:
+        """Wait until the agents' process offers commands for all vehicles.
+
+        :param alive: raises an error when the process has died.
+        :raises MissionError: it does not in time.
+        """
+        topics = [f"/{robot.name}/cmd_velocity_world" for robot in self.settings.robots]
+
+        def offered() -> bool:
+            alive()
+            return all(self.node.count_publishers(topic) for topic in topics)
+
+        self.wait("the agents' start", offered, AGENTS_S)
 
     def take_off(self) -> None:
         """Arm, climb to the middle of the room, go to the start."""

@@ -12,7 +12,6 @@ from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.settings import SwarmSettings
-from dtsa_agent.crazyflie.state import to_map
 
 PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
 APART_M = 0.35  # m: closer than this to each other nobody takes off or flies to its start
@@ -27,22 +26,26 @@ class MissionError(DtsaError):
 def check_places(settings: SwarmSettings, config: SwarmConfig) -> Scenario:
     """The scenario, once it is sure that everybody stands where it begins.
 
-    :raises ConfigError: ids are missing, or a vehicle's place is not where the scenario wants it.
+    :raises ConfigError: ids are missing, or vehicles' places are not where the scenario wants them: all of them.
     """
     ids = [robot.id for robot in settings.robots]
     if ids != list(range(1, config.agents + 1)):
         raise ConfigError("robots", ids, f"the ids 1 to {config.agents}, one for each agent")
     scenario = make_scenario(config)
-    origin = settings.station.room_origin_in_world
-    for robot, start in zip(settings.robots, scenario.start.T, strict=True):
-        x, y, _ = to_map(robot.initial_position, origin)
-        if np.hypot(x - start[0], y - start[1]) > PLACE_M:
-            raise ConfigError(
-                f"robots.{robot.name}.initial_position", list(robot.initial_position),
-                f"a place within {PLACE_M} m of ({start[0] + origin[0]:.2f}, {start[1] + origin[1]:.2f}), "
-                "where this scenario begins",
-            )  # fmt: skip
+    wrong = misplaced(settings, scenario)
+    if wrong:
+        raise ConfigError("initial_position", ", ".join(wrong), "; ".join(wrong.values()))
     return scenario
+
+
+def misplaced(settings: SwarmSettings, scenario: Scenario) -> dict[str, str]:
+    """Vehicles whose `initial_position` is not where the scenario begins, and where that is."""
+    x0, y0, _ = settings.station.room_origin_in_world
+    wrong = {}
+    for robot, (x, y) in zip(settings.robots, scenario.start[:2].T.tolist(), strict=True):
+        if np.hypot(robot.initial_position[0] - x0 - x, robot.initial_position[1] - y0 - y) > PLACE_M:
+            wrong[robot.name] = f"{robot.name} within {PLACE_M} m of ({x + x0:.2f}, {y + y0:.2f})"
+    return wrong
 
 
 def assign_places(config: SwarmConfig, measured: Array) -> SwarmConfig:
