@@ -14,13 +14,17 @@ The bridge to the Crazyflies of a swarm.yaml: topics /cfN/..., services /cfN/...
 The first Ctrl-C lands all, the second stops all motors."""
 EXAMPLES = (
     ("--config swarm.yaml --check", "is everything there that a flight needs?"),
+    ("--places 10 > swarm.yaml", "a file to begin with: where ten begin, and rates for one dongle"),
     ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
-    parser.add_argument("--config", type=Path, required=True, help="swarm.yaml: robots, types, defaults, station")
+    parser.add_argument("--config", type=Path, help="swarm.yaml: robots, types, defaults, station")
+    parser.add_argument(
+        "--places", metavar="N", help="print a swarm.yaml for a mission of N on one dongle: places and rates; and end"
+    )
     parser.add_argument(
         "--backend",
         choices=("cflib", "sim"),
@@ -58,14 +62,25 @@ def use_simulated_radio(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the bridge until Ctrl-C."""
+    from dtsa_agent.core.errors import ConfigError
     from dtsa_agent.crazyflie.addresses import check_budget
     from dtsa_agent.crazyflie.link import require_cflib
     from dtsa_agent.crazyflie.settings import load_swarm
+    from dtsa_bench.crazyflies.missions.places import example_swarm, place_lines
+    from dtsa_bench.runs.options import whole_number
 
+    if args.places is not None:
+        print(example_swarm(whole_number(args.places, "places", 1, 100)))
+        return 0
+    if args.config is None:
+        raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
     use_simulated_radio(args)
     settings = load_swarm(args.config)
+    if args.check is not None:
+        print("\n".join([f"{args.config}: {len(settings.robots)} Crazyflies", *settings.summary()]), flush=True)
+        for line in place_lines(settings):
+            print(f"for a mission: {line}", flush=True)
     if args.check == FILE:
-        print("\n".join([f"{args.config}: {len(settings.robots)} Crazyflies", *settings.summary()]))
         check_budget(settings.loads, force=settings.station.force_budget)
         return 0
     require_cflib()

@@ -191,7 +191,8 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     path = Path(args.config)
     settings = load_swarm(path)
     from dtsa_agent.ros.common.process.loop import Stop
-    from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies, mission_defaults
+    from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
+    from dtsa_bench.crazyflies.missions.places import mission_defaults
 
     if getattr(args, "run.mode") is None:
         setattr(args, "run.mode", "realtime")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -50,18 +49,6 @@ from .places import APART_M, MissionError, check_places
 
 RECORDER_END_S = 10.0
 BRIDGE_END_S = 40.0  # s, to land by itself and close the links
-
-
-def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of the swarm that a mission chooses unless the user does.
-
-    The paper's room: an ellipse of half axes 1.2 m and 2.0 m, ids in order, so that everyone finds its place. More room
-    between two vehicles than in simulation, because they know where they are to a few centimetres only; and the policy
-    with which tables agree even where frames are lost.
-    """
-    room = {"shape": "ellipse", "axis_x_m": 1.2, "axis_y_m": 2.0, "permute": False}
-    defaults = {"agents": len(settings.robots), "avoider": "crazyflie", "policy": "lease"} | room
-    return {name: value for name, value in defaults.items() if given.get(name) is None}
 
 
 class MissionWatch(ChannelObserver):
