@@ -12,7 +12,7 @@ a closed port for the end of the link. So here are drivers (`cflib.crtp.crtpdriv
   acknowledgements are missing, commands are sent with either bit, one after the other: one of them counts.
 - A link never ends by itself. A dongle that is pulled is named; once it is there again its links go on.
 
-What cflib does on such a link, `close_link` above all, sends no set-point of its own: those of port 3 are dropped.
+Set-points of port 3, of which `close_link` sends one, never leave.
 
 Upstream: crazyflie-lib-python, issue 63 (links that close after missing acknowledgements), and crazyflie-link-cpp,
 issue 24 (set-points that are repeated although newer ones wait).
@@ -27,7 +27,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -37,24 +37,21 @@ from cflib.crtp.crtpstack import CRTPPacket
 from cflib.crtp.exceptions import WrongUriType
 from cflib.drivers.crazyradio import Crazyradio, get_serials
 
-from .addresses import ANY, Address, parse_address
+from .addresses import ANY, BITRATES, Address, parse_address
 
 Report = Callable[[str, str], None]  # level and line
 COMMAND, SETPOINT, POSITION, REQUEST, EMPTY = "command", "setpoint", "position", "request", "empty"
 TURNS = (SETPOINT, REQUEST, POSITION)
 NULL = b"\xff"
-SAFELINK = b"\xff\x05\x01"  # asks for the bits, and is answered by itself
-SAFELINK_TRIES = 10
-HEADER_MASK, UP_BIT, DOWN_BIT = 0xF3, 0x08, 0x04
-EMERGENCY = (b"\x91\x03", b"\x61\x03")  # by the supervisor's port, and the one of firmware before protocol version 12
-WATCHDOG = (b"\x91\x04", b"\x61\x04")
-END_OF_STREAM = 0x71
-LEGACY_SETPOINT = 0x30
-COMMAND_LIFE_S = 1.0  # one that waited longer would take somebody by surprise
-MOST_COMMANDS = 20
+SAFELINK, SAFELINK_TRIES = b"\xff\x05\x01", 10  # asks for the bits, and is answered by itself
+HEADER, UP_BIT, DOWN_BIT = 0xF3, 0x08, 0x04
+# By the supervisor's port, and by the localization's, where firmware before protocol version 12 has them.
+EMERGENCY, WATCHDOG = (b"\x91\x03", b"\x61\x03"), (b"\x91\x04", b"\x61\x04")
+END_OF_STREAM, HIGH_LEVEL, LEGACY_SETPOINT = 0x71, 0x80, 0x30
+COMMAND_LIFE_S, MOST_COMMANDS = 1.0, 20  # one that waited longer would take somebody by surprise
 DEAF_S = 0.25  # nothing acknowledged for that long, though the dongle asks all the time
 RELAXED_S, BUSY_POLLS = 0.01, 10  # pause between polls once so many in a row were answered with nothing
-DEAF_POLL_S = 0.02  # pause between polls of one that has not answered for a second
+ABSENT_S, ABSENT_POLL_S = 1.0, 0.02  # pause between polls of one that has not answered for that long
 REOPEN_S = 0.3  # between attempts to find a dongle that has gone
 LATE_ANSWERS = 3  # a dongle that does not answer so often has gone
 CLOSE_S = 0.3  # longest wait at the end for commands that have not been sent
@@ -65,12 +62,12 @@ FOREIGN_SHARE, FOREIGN_PACKETS = 0.25, 200  # so many packets repeated, of the l
 
 def kind_of(packet: bytes) -> str:
     """Return how a packet to a Crazyflie is treated."""
-    header, first = packet[0] & HEADER_MASK, packet[1] if len(packet) > 1 else -1
+    header, first = packet[0] & HEADER, packet[1] if len(packet) > 1 else -1
     if header == 0x70:
         return SETPOINT
     if header == 0x60 or (header == 0x61 and first == 8):
         return POSITION
-    return COMMAND if header in (END_OF_STREAM, 0x80, 0x91, 0x61, 0xD0) else REQUEST
+    return COMMAND if header in (END_OF_STREAM, HIGH_LEVEL, 0x91, 0x61, 0xD0) else REQUEST
 
 
 class Mailbox:
@@ -85,43 +82,35 @@ class Mailbox:
         self.replaced = 0  # set-points that a newer one overtook
 
     def put(self, packet: bytes) -> None:
-        """Add a packet; an emergency stop empties the box first."""
-        kind, start = kind_of(packet), bytes((packet[0] & HEADER_MASK, *packet[1:2]))
+        """Add a packet; an order ends the stream of set-points, an emergency stop empties the box."""
+        kind, start = kind_of(packet), bytes((packet[0] & HEADER, *packet[1:2]))
         with self._lock:
-            if kind in (SETPOINT, POSITION):
-                self.replaced += kind == SETPOINT and kind in self._newest
-                self._newest[kind] = packet
-                return
             if kind == REQUEST:
                 self._requests.append(packet)
-                return
-            if start in EMERGENCY:
-                self._requests.clear()
-                self._commands = deque((c for c in self._commands if c[0] == packet), MOST_COMMANDS)
-            if start in EMERGENCY or packet[0] & HEADER_MASK in (END_OF_STREAM, 0x80):
-                self._newest.pop(SETPOINT, None)  # an order ends the stream
-            if start not in WATCHDOG or all(packet != waiting for waiting, _ in self._commands):
+            elif kind != COMMAND:
+                self.replaced += kind == SETPOINT and kind in self._newest
+                self._newest[kind] = packet
+            elif start not in WATCHDOG or all(packet != waiting for waiting, _ in self._commands):
+                if start in EMERGENCY:
+                    self._requests.clear()
+                    self._commands = deque((c for c in self._commands if c[0] == packet), MOST_COMMANDS)
+                if start in EMERGENCY or start[0] in (END_OF_STREAM, HIGH_LEVEL):
+                    self._newest.pop(SETPOINT, None)
                 self._commands.append((packet, time.monotonic()))
 
-    def take(self, *kinds: str) -> tuple[str, bytes] | None:
-        """Return the next packet of these kinds (none given: of any) and its kind; None: there is none."""
+    def take(self, kind: str = "") -> tuple[str, bytes] | None:
+        """Return the next packet, of one kind or of any, and its kind; None: there is none."""
         with self._lock:
-            while self._commands and (not kinds or COMMAND in kinds):
+            while self._commands and kind in ("", COMMAND):
                 packet, since = self._commands.popleft()
                 if time.monotonic() - since < COMMAND_LIFE_S or packet[1:2] == b"\x03":
                     return COMMAND, packet
-            for step in range(len(TURNS)):
-                kind = TURNS[(self._turn + step) % len(TURNS)]
-                if kinds and kind not in kinds:
-                    continue
-                if kind == REQUEST and self._requests:
-                    found = self._requests.popleft()
-                elif kind in self._newest:
-                    found = self._newest.pop(kind)
-                else:
-                    continue
-                self._turn = (TURNS.index(kind) + 1) % len(TURNS)
-                return kind, found
+            for number in range(self._turn, self._turn + len(TURNS)):
+                turn = TURNS[number % len(TURNS)]
+                waits = self._requests if turn == REQUEST else turn in self._newest
+                if waits and kind in ("", turn):
+                    self._turn = (number + 1) % len(TURNS)
+                    return turn, self._requests.popleft() if turn == REQUEST else self._newest.pop(turn)
         return None
 
     def put_back(self, request: bytes) -> None:
@@ -150,21 +139,20 @@ class _Driver(CRTPDriver):  # type: ignore[misc]
         self.quality: float | None = None  # 0..1; None: the link does not say
         self.rssi = 0  # -dBm; 0: the link does not say
         self.acknowledged = float("-inf")  # s, monotonic: when anything last came, or was acknowledged
-        self.on_heard: Callable[[], None] = lambda: None  # called with each that ends a silence
-        self.on_setpoint: Callable[[], None] = lambda: None  # called when a set-point has been sent
+        self.on_heard: Callable[[], None] = lambda: None  # the end of a silence
+        self.on_setpoint: Callable[[], None] = lambda: None  # a set-point has been sent
 
     def limit(self, polls_hz: float) -> None:
         """From now on send at most so many packets a second."""
 
     def _heard(self, now: float) -> None:
-        silent = now - self.acknowledged > DEAF_S
-        self.acknowledged = now
+        silent, self.acknowledged = now - self.acknowledged > DEAF_S, now
         if silent:
             self.on_heard()
 
 
 class RadioDriver(_Driver):
-    """One Crazyflie's link over a dongle. `exchange` and what it calls belong to the dongle's thread."""
+    """One Crazyflie's link over a dongle. `due`, `exchange` and what they call belong to the dongle's thread."""
 
     def __init__(self, radios: Radios) -> None:
         super().__init__()
@@ -173,10 +161,9 @@ class RadioDriver(_Driver):
         self._dongle: Dongle | None = None
         self._pending: tuple[str, bytes] | None = None  # sent, and not acknowledged
         self._tries, self._safelink, self._up, self._down = 0, False, 0, 0
-        self._empty_polls, self._next, self._least_s = 0, 0.0, 0.0
+        self._last = self._least_s = 0.0  # s: when a packet last went (monotonic), and shortest time between two
+        self._empty_polls, self._established = 0, False
         self._scores: deque[int] = deque(maxlen=100)  # 10 less the repetitions of each packet
-        self._established = False
-        self.needs_resending = True
 
     def connect(self, uri: str, statistics: Any, error: Callable[[str], None] | None) -> None:
         """Open the link; raises an error while there is no such dongle."""
@@ -184,10 +171,10 @@ class RadioDriver(_Driver):
             raise WrongUriType("not a radio")
         self.address = parse_address(uri)
         self.node = tuple(bytes.fromhex(self.address.node))
-        self.rate = ("250K", "1M", "2M").index(self.address.rate)
-        _, _, limit = uri.partition("rate_limit=")
-        if limit.partition("&")[0].isdigit() and int(limit.partition("&")[0]):
-            self.limit(float(limit.partition("&")[0]))
+        self.rate = tuple(BITRATES).index(self.address.rate)
+        limit = uri.partition("rate_limit=")[2].partition("&")[0]
+        if limit.isdigit() and int(limit):
+            self.limit(float(limit))
         dongle = self._radios.dongle(self.address)
         dongle.add(self)
         self._dongle = dongle
@@ -212,40 +199,39 @@ class RadioDriver(_Driver):
             dongle.remove(self)
         self._arrived.put(None)  # wakes whoever waits for a packet
 
-    # -- in the dongle's thread -------------------------------------------------------------------------------------
     def due(self, now: float) -> float:
         """Return when the next packet goes (s, monotonic)."""
-        if now - self.acknowledged > 1.0 and self._tries >= SAFELINK_TRIES and not self.mailbox.has_commands:
-            return max(self._next, self._last + DEAF_POLL_S)
-        waits = self._pending is None and self.mailbox.empty
-        return max(self._next, self._last + RELAXED_S) if waits and self._empty_polls > BUSY_POLLS else self._next
+        pause = self._least_s
+        if now - self.acknowledged > ABSENT_S and self._tries >= SAFELINK_TRIES and not self.mailbox.has_commands:
+            pause = max(pause, ABSENT_POLL_S)
+        elif self._pending is None and self.mailbox.empty and self._empty_polls > BUSY_POLLS:
+            pause = max(pause, RELAXED_S)
+        return self._last + pause
 
-    _last = 0.0
+    def exchange(self, radio: Any) -> bool | None:
+        """Send the next packet and take the answer.
 
-    def exchange(self, radio: Any) -> bool:
-        """Send the next packet and take the answer; False: the dongle has not answered."""
+        :returns: whether it had to be repeated; None: the dongle has not answered.
+        """
         now = self._last = time.monotonic()
-        self._next = now + self._least_s
         radio.set_channel(self.address.channel)
         radio.set_address(self.node)
         radio.set_data_rate(self.rate)
         greeting = not self._safelink and self._tries < SAFELINK_TRIES
         packet, both = (SAFELINK, False) if greeting else self._choose(now)
-        answer = None
-        for bit in (1 - self._up, self._up) if both else (self._up,):
-            answer = radio.send_packet(self._marked(packet, bit) if self._safelink else packet)
-            if answer is None:
-                return False
-            if answer.ack:
-                self._answered(answer, greeting, time.monotonic())
-                break
         self._tries += greeting
-        return True
+        answer = None
+        for up in (1 - self._up, self._up) if both else (self._up,):
+            bits = bytes((packet[0] & HEADER | up * UP_BIT | self._down * DOWN_BIT,)) if self._safelink else packet[:1]
+            answer = radio.send_packet(bits + packet[1:])
+            if answer is not None and answer.ack:
+                self._answered(bytes(answer.data), answer.retry, greeting)
+                return bool(answer.retry)
+        return None if answer is None else False
 
     def _choose(self, now: float) -> tuple[bytes, bool]:
         """Return the packet to send, and whether with either bit."""
-        box, pending = self.mailbox, self._pending
-        both = False
+        box, pending, both = self.mailbox, self._pending, False
         if pending is None:
             pending = box.take() or (EMPTY, NULL)
         elif now - self.acknowledged > DEAF_S and (command := box.take(COMMAND)) is not None:
@@ -257,66 +243,59 @@ class RadioDriver(_Driver):
         self._pending = pending
         return pending[1], both
 
-    def _marked(self, packet: bytes, up: int) -> bytes:
-        return bytes((packet[0] & HEADER_MASK | up * UP_BIT | self._down * DOWN_BIT,)) + packet[1:]
-
-    def _answered(self, answer: Any, greeting: bool, now: float) -> None:
-        data = bytes(answer.data)
-        self._scores.append(10 - answer.retry)
+    def _answered(self, data: bytes, repeated: int, greeting: bool) -> None:
+        self._scores.append(10 - repeated)
         self.quality = sum(self._scores) / len(self._scores) / 10
+        kind, fresh = EMPTY, bool(data)
         if greeting:
-            self._safelink = data == SAFELINK
+            self._safelink, fresh = data == SAFELINK, False
             self.needs_resending = not self._safelink
-            self._heard(now)
-            return
-        kind, self._pending = self._pending[0] if self._pending else EMPTY, None
-        if kind != EMPTY:
-            self.sent += 1
+        else:
+            kind, self._pending = self._pending[0] if self._pending else EMPTY, None
+            if self._safelink:
+                fresh = fresh and data[0] & DOWN_BIT == self._down * DOWN_BIT
+                self._up, self._down = 1 - self._up, 1 - self._down if fresh else self._down
+        self.sent += kind != EMPTY
         if kind == SETPOINT:
             self.on_setpoint()
-        fresh = bool(data)
-        if self._safelink:
-            self._up = 1 - self._up
-            fresh = bool(data) and data[0] & DOWN_BIT == self._down * DOWN_BIT
-            self._down = 1 - self._down if fresh else self._down
-        self._heard(now)
-        if fresh and data[0] & HEADER_MASK == HEADER_MASK:  # an empty one
-            self._empty_polls += kind == EMPTY
-            if len(data) > 2 and data[1] == 0x01:
-                self.rssi = data[2]
-            if self._established:
-                return
-        if fresh:
+        self._heard(time.monotonic())
+        if not fresh:
+            return
+        nothing = data[0] & HEADER == HEADER
+        self._empty_polls = self._empty_polls + (kind == EMPTY) if nothing else 0
+        if nothing and data[1:2] == b"\x01" and len(data) > 2:
+            self.rssi = data[2]
+        if not nothing or not self._established:  # cflib wants one packet, whatever it is, to begin
             self._established = True
-            self._empty_polls = 0 if data[0] & HEADER_MASK != HEADER_MASK else self._empty_polls
             self._arrived.put(CRTPPacket(data[0], list(data[1:])))
 
 
 class Dongle(threading.Thread):
-    """A Crazyradio, and the thread that serves its Crazyflies in turn. It ends with the last link, unless it is kept.
+    """A Crazyradio, and the thread that serves its Crazyflies in turn.
 
     :param radio: number or serial.
+    :param names: of Crazyflies, by their links.
     """
 
     def __init__(self, radio: str, report: Report, names: dict[str, str]) -> None:
         super().__init__(name=f"radio {radio}", daemon=True)
         self.radio, self._report, self._names = radio, report, names
+        self.foreign = False  # somebody else sends on the channel, as it seems
         self._condition = threading.Condition()
         self._links: list[RadioDriver] = []
-        self._broadcasts: deque[tuple[int, int]] = deque()  # channel and data rate of packets that stop all
-        self._stopping = False
+        self._stops: deque[tuple[int, int]] = deque()  # channel and data rate of packets that stop all
+        self._closing = False
         self._late = 0
+        self._repeated: deque[bool] = deque()
         self._serial = ""
         self._device: Any = self._open()
-        self._repeated: deque[bool] = deque(maxlen=FOREIGN_PACKETS)
-        self.foreign = False  # somebody else sends on the channel, as it seems
         self.start()
 
     def _open(self) -> Any:
         serials = get_serials()
         if not self._serial:
-            known = int(self.radio) < len(serials) if self.radio.isdigit() and len(self.radio) < 10 else False
-            self._serial = serials[int(self.radio)] if known else self.radio.upper()
+            number = int(self.radio) if len(self.radio) < 10 else len(serials)
+            self._serial = serials[number] if number < len(serials) else self.radio
         if self._serial not in serials:
             raise OSError(f"radio {self.radio} is not there")
         if serials.count(self._serial) > 1:  # old firmware: all have one serial number
@@ -345,72 +324,55 @@ class Dongle(threading.Thread):
         with self._condition:
             self._condition.notify()
 
-    def broadcast(self, channel: int, rate: int) -> None:
+    def stop_channel(self, channel: int, rate: int) -> None:
         """Stop all Crazyflies on a channel; does not wait."""
-        with self._condition:
-            self._broadcasts.append((channel, rate))
-            self._condition.notify()
+        self._stops.append((channel, rate))
+        self.wake()
 
     def close(self) -> None:
         """End the thread."""
-        with self._condition:
-            self._stopping = True
-            self._condition.notify()
-        if self is not threading.current_thread():
-            self.join(2.0)
+        self._closing = True
+        self.wake()
+        self.join(2.0)
 
     def run(self) -> None:
         """Serve until it is closed."""
         turn = 0
-        while True:
-            with self._condition:
-                if self._stopping and not self._broadcasts:
-                    break
-                links, now = self._links, time.monotonic()
-                order = [links[(turn + k) % len(links)] for k in range(len(links))]
-                due = [link.due(now) for link in order]
-                ready = next((link for link, when in zip(order, due, strict=True) if when <= now), None)
-                job = self._broadcasts.popleft() if self._broadcasts else None
-                if self._device is not None and ready is None and job is None:
-                    self._condition.wait(max(0.0, min(due) - now) if due else None)
-                    continue
-                turn = (links.index(ready) + 1) % len(links) if ready is not None else turn
+        while not self._closing or self._stops:
             if self._device is None and not self._find():
                 time.sleep(REOPEN_S)
                 continue
+            with self._condition:
+                now, links = time.monotonic(), self._links[turn:] + self._links[:turn]
+                due = [link.due(now) for link in links]
+                ready = next((link for link, when in zip(links, due, strict=True) if when <= now), None)
+                if ready is None and not self._stops and not self._closing:
+                    self._condition.wait(max(0.0, min(due) - now) if due else None)
+                    continue
+                turn = (self._links.index(ready) + 1) % len(self._links) if ready is not None else 0
             try:
-                if job is not None:
-                    self._send_stops(*job)
+                if self._stops:
+                    self._send_stops(*self._stops.popleft())
                 if ready is not None:
                     self._serve(ready)
             except Exception as error:  # USB's errors have no common base
                 self._lose(str(error))
-        if self._device is not None:
-            with contextlib.suppress(Exception):
-                self._device.close()
+        with contextlib.suppress(Exception):
+            self._device.close()
 
     def _serve(self, link: RadioDriver) -> None:
-        before = len(link._scores)
-        if link.exchange(self._device):
-            self._late = 0
-        else:
-            self._late += 1
-            if self._late >= LATE_ANSWERS or self._serial not in get_serials():
-                raise OSError("no answer on USB")
-        if len(link._scores) and before:
-            self._watch_repetitions(link)
-
-    def _watch_repetitions(self, link: RadioDriver) -> None:
-        self._repeated.append(link._scores[-1] < 10)
-        if len(self._repeated) < FOREIGN_PACKETS:
-            return
-        share = sum(self._repeated) / FOREIGN_PACKETS
-        self._repeated.clear()
-        if share > FOREIGN_SHARE and not self.foreign:
-            channel = link.address.channel
-            self._report("warn", f"radio {self.radio}: {share:.0%} of the packets on channel {channel} are repeated: "
-                         "does somebody else send there?")  # fmt: skip
-        self.foreign = share > FOREIGN_SHARE
+        repeated = link.exchange(self._device)
+        self._late = self._late + 1 if repeated is None else 0
+        if self._late and (self._late >= LATE_ANSWERS or self._serial not in get_serials()):
+            raise OSError("no answer on USB")
+        self._repeated.append(bool(repeated))
+        if len(self._repeated) == FOREIGN_PACKETS:
+            share, before = sum(self._repeated) / FOREIGN_PACKETS, self.foreign
+            self._repeated.clear()
+            self.foreign = share > FOREIGN_SHARE
+            if self.foreign and not before:
+                text = f"{share:.0%} of the packets on channel {link.address.channel} are repeated"
+                self._report("warn", f"radio {self.radio}: {text}: does somebody else send there?")
 
     def _send_stops(self, channel: int, rate: int) -> None:
         self._device.set_channel(channel)
@@ -429,13 +391,11 @@ class Dongle(threading.Thread):
             device.close()
 
     def _find(self) -> bool:
-        try:
+        with contextlib.suppress(Exception):  # not there yet
             self._device = self._open()
-        except Exception:  # not there yet
-            return False
-        self._late = 0
-        self._report("info", f"radio {self.radio} ({self._serial}) is there again")
-        return True
+            self._late = 0
+            self._report("info", f"radio {self.radio} ({self._serial}) is there again")
+        return self._device is not None or self._closing
 
 
 class UdpDriver(_Driver):
@@ -449,8 +409,7 @@ class UdpDriver(_Driver):
         if not uri.startswith("udp://"):
             raise WrongUriType("not UDP")
         address = parse_address(uri)
-        self.needs_resending = False
-        self._error = error
+        self.needs_resending, self._error = False, error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((address.host, address.port))
 
@@ -472,8 +431,7 @@ class UdpDriver(_Driver):
         return True
 
     def receive_packet(self, wait: float = 0) -> Any:
-        sock = self._socket
-        if sock is None:
+        if (sock := self._socket) is None:
             return None
         try:
             sock.settimeout(None if wait < 0 else wait)
@@ -490,9 +448,8 @@ class UdpDriver(_Driver):
         return CRTPPacket(data[0], list(data[1:]))
 
     def _fail(self, problem: str) -> None:
-        error = self._error
+        error, self._error = self._error, None
         if error is not None and self._socket is not None and self.acknowledged == float("-inf"):
-            self._error = None
             error(problem)
 
     def close(self) -> None:
@@ -504,7 +461,7 @@ class UdpDriver(_Driver):
 
 
 class Radios:
-    """The dongles of one bridge; cflib opens links by the drivers above from `install` to `close`.
+    """The dongles of one bridge; cflib opens links by the drivers above until it is closed.
 
     :param robots: names and addresses.
     :param report: called with a level and a line about dongles that come and go.
@@ -523,36 +480,28 @@ class Radios:
 
     def dongle(self, address: Address) -> Dongle:
         """Return the dongle of an address; raises an error if it is not there."""
-        radio = self._any(address.channel) if address.radio == ANY else address.radio
+        radio = self._radio(address)
         with self._lock:
             if radio not in self._dongles:
                 self._dongles[radio] = Dongle(radio, self._report, self._names)
             return self._dongles[radio]
 
-    def _any(self, channel: int) -> str:
-        """Return the dongle for links that name none: one a channel, as far as there are dongles."""
+    def _radio(self, address: Address) -> str:
+        """Return the dongle of an address; of links that name none: one a channel, as far as there are dongles."""
+        if address.radio != ANY:
+            return address.radio
         named = {a.channel: a.radio for a in reversed(self._addresses) if a.radio != ANY}
-        if channel in named:
-            return named[channel]
-        channels = sorted({a.channel for a in self._addresses if a.radio == ANY} - named.keys())
-        free = [n for n in range(len(get_serials())) if str(n) not in named.values()] or [0]
-        return str(free[channels.index(channel) % len(free)])
-
-    def _used(self, serials: Sequence[str]) -> set[int]:
-        found = set()
-        for address in self._addresses:
-            radio = self._any(address.channel) if address.radio == ANY else address.radio
-            found.add(serials.index(radio) if radio in serials else int(radio) if len(radio) < 10 else -1)
-        return found
+        channels = sorted({a.channel for a in self._addresses} - named.keys())
+        free = [str(n) for n in range(len(get_serials())) if str(n) not in named.values()] or ["0"]
+        return named.get(address.channel) or free[channels.index(address.channel) % len(free)]
 
     def keep_spare(self) -> None:
         """Keep the first dongle that no link uses for emergency stops."""
         if not self._addresses:
             return
-        serials = get_serials()
-        used = self._used(serials)
-        for number in range(len(serials)):
-            if number in used:
+        used = {self._radio(address) for address in self._addresses}
+        for number, serial in enumerate(get_serials()):
+            if used & {str(number), serial}:
                 continue
             try:
                 self.spare = Dongle(str(number), self._report, self._names)
@@ -574,10 +523,10 @@ class Radios:
         for address in {(a.radio, a.channel, a.rate): a for a in self._addresses}.values():
             with contextlib.suppress(Exception):  # a dongle that is not there must not keep the others from it
                 dongle = self.spare or self.dongle(address)
-                jobs.append(partial(dongle.broadcast, address.channel, ("250K", "1M", "2M").index(address.rate)))
+                jobs.append(partial(dongle.stop_channel, address.channel, tuple(BITRATES).index(address.rate)))
 
         def send() -> None:
-            for _ in range(ROUNDS):
+            for _ in range(ROUNDS if jobs else 0):
                 for job in jobs:
                     job()
                 time.sleep(PAUSE_S)

@@ -40,9 +40,8 @@ class PositionSettings(Settings):
         choices=(NONE, POSE, NAMED_POSES),
     )
     topic: str = setting("", "topic of the poses; {name} is the Crazyflie's; empty: /{name}/pose, or /poses if named")
-    send: str = setting(
-        EXTPOSE, "what the bridge sends to the Crazyflies: places, or places with attitudes", choices=(EXTPOS, EXTPOSE)
-    )
+    send: str = setting(EXTPOSE, "what the bridge sends to the Crazyflies: places, or places with attitudes",
+        choices=(EXTPOS, EXTPOSE))  # fmt: skip
     max_rate_hz: float = setting(
         100.0, "sent at most this often, each to its own Crazyflie; counts in the radio budget",
         unit="Hz", minimum=1, maximum=200,
@@ -51,10 +50,8 @@ class PositionSettings(Settings):
         0.1, "largest distance from the estimate to motion capture with which a vehicle is ready, armed, and takes off",
         unit="m", minimum=0.005, maximum=1,
     )  # fmt: skip
-    jump_m: float = setting(
-        0.3, f"a pose farther than this, and {FASTEST_MPS:g} m/s, from the one before is refused",
-        unit="m", minimum=0.01, maximum=10,
-    )  # fmt: skip
+    jump_m: float = setting(0.3, f"a pose farther than this, and {FASTEST_MPS:g} m/s, from the one before is refused",
+        unit="m", minimum=0.01, maximum=10)  # fmt: skip
     late_s: float = setting(
         0.06, "a pose that takes so much longer than the fastest one is refused: the vehicle has moved on",
         unit="s", minimum=0.005, maximum=10,

@@ -20,14 +20,18 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 
 from .state import IN_AIR, State, Vector, VehicleState, outside_by, place_text, to_map
 
+UNKNOWN = frozenset({State.DISCONNECTED, State.CONNECTING})
+MAY_MOVE = frozenset({State.ARMED, State.FLYING, State.LANDING, State.LOST})
+UNSEEN = "not seen by motion capture"
 ESTIMATE_HOLD_S = 1.0  # a vehicle whose estimate is wrong stands still that long, then it sinks
 ACCELERATION = 1.5  # m/s per s of silence that velocities may have changed between two packets
 STUCK_M = 0.15  # a place that does not change has lost its velocity after so much of it
@@ -53,40 +57,28 @@ class SafetySettings(Settings):
     geofence: bool = setting(True, "watch that no vehicle leaves the box")
     geofence_min: Vector = setting((-1.5, -2.3, -0.95), "lower corner of the box, frame map", unit="m")
     geofence_max: Vector = setting((1.5, 2.3, 0.95), "upper corner of the box, frame map", unit="m")
-    geofence_tolerance_m: float = setting(
-        0.05, "measuring error that the fence lets pass", unit="m", minimum=0, maximum=1
-    )
-    geofence_hard_m: float = setting(
-        0.8, "this far outside the motors are stopped", unit="m", minimum=0.05, maximum=100
-    )
+    geofence_tolerance_m: float = setting(0.05, "measuring error that the fence lets pass",
+        unit="m", minimum=0, maximum=1)  # fmt: skip
+    geofence_hard_m: float = setting(0.8, "this far outside the motors are stopped",
+        unit="m", minimum=0.05, maximum=100)  # fmt: skip
     battery: bool = setting(True, "watch the batteries")
     battery_s: float = setting(1.0, "how long the voltage must be low", unit="s", minimum=0, maximum=60)
-    link_age_s: float = setting(
-        0.5, "silence that makes a flying vehicle lost; 0: never", unit="s", minimum=0, maximum=10
-    )
-    command_age_s: float = setting(
-        0.25, "age of the streamed command at which the place is held; 0: never", unit="s", minimum=0, maximum=0.45
-    )
-    command_land_s: float = setting(
-        3.0, "age of the streamed command at which the vehicle lands", unit="s", minimum=0.1, maximum=600
-    )
-    heartbeat_s: float = setting(
-        1.0,
-        "silence of the ground station, once heard, that stops all motors; 0: never",
-        unit="s",
-        minimum=0,
-        maximum=60,
-    )
-    min_distance_m: float = setting(
-        0.15, "two flying vehicles closer than this land; 0: never", unit="m", minimum=0, maximum=10
-    )
+    link_age_s: float = setting(0.5, "silence that makes a flying vehicle lost; 0: never",
+        unit="s", minimum=0, maximum=10)  # fmt: skip
+    command_age_s: float = setting(0.25, "age of the streamed command at which the place is held; 0: never",
+        unit="s", minimum=0, maximum=0.45)  # fmt: skip
+    command_land_s: float = setting(3.0, "age of the streamed command at which the vehicle lands",
+        unit="s", minimum=0.1, maximum=600)  # fmt: skip
+    heartbeat_s: float = setting(1.0, "silence of the ground station, once heard, that stops all motors; 0: never",
+        unit="s", minimum=0, maximum=60)  # fmt: skip
+    min_distance_m: float = setting(0.15, "two flying vehicles closer than this land; 0: never",
+        unit="m", minimum=0, maximum=10)  # fmt: skip
     position_age_s: float = setting(
         0.3, "age of the last pose from motion capture at which the place is held; 0: never",
         unit="s", minimum=0, maximum=10,
     )  # fmt: skip
-    position_land_s: float = setting(
-        1.0, "age of the last pose from motion capture at which the vehicle lands", unit="s", minimum=0.05, maximum=60
-    )
+    position_land_s: float = setting(1.0, "age of the last pose from motion capture at which the vehicle lands",
+        unit="s", minimum=0.05, maximum=60)  # fmt: skip
     estimate_jump_m: float = setting(
         0.5, "an estimate that moves so far at once, its velocity apart, is wrong; 0: never",
         unit="m", minimum=0, maximum=100,
@@ -149,6 +141,9 @@ class Verdict:
     reason: str
 
 
+Demands = Iterator[tuple[Action, str]]  # what a rule wants done with a vehicle, and why
+
+
 class SafetyMonitor:
     """Applies the rules again and again.
 
@@ -157,123 +152,83 @@ class SafetyMonitor:
 
     def __init__(self, settings: SafetySettings) -> None:
         self.settings = settings
-        self._active: set[tuple[str, str]] = set()
+        self._active: set[tuple[str, str, Action]] = set()
         self._low_since: dict[tuple[str, str], float] = {}
 
     def check(self, now: float, vehicles: Sequence[Watched], heartbeat_age: float | None) -> list[Verdict]:
-        """What has to be done now.
+        """Return what has to be done now.
 
         :param heartbeat_age: s since the ground station's last heartbeat; None: it has never been heard.
         """
-        found: list[Verdict] = []
-        for vehicle in vehicles:
-            found += self._fence(vehicle)
-            found += self._battery(now, vehicle)
-            found += self._link(vehicle)
-            found += self._commands(vehicle)
-            found += self._positions(vehicle)
-            found += self._estimate(vehicle)
-        found += self._distance(vehicles)
-        found += self._heartbeat(vehicles, heartbeat_age)
-        keys = {(v.name, v.rule + v.action.value) for v in found}
-        fresh = [v for v in found if (v.name, v.rule + v.action.value) not in self._active]
-        self._active = keys
+        s, found = self.settings, []
+        for v in vehicles:
+            rules = {
+                "geofence": self._fence(v), "battery": self._battery(now, v), "link": self._link(v),
+                "commands": _waits(v, v.command_age, s.command_age_s, s.command_land_s, "no command"),
+                "positions": _waits(v, v.position_age, s.position_age_s, s.position_land_s, UNSEEN),
+                "estimate": _estimate(v),
+            }  # fmt: skip
+            found += [Verdict(v.name, action, rule, why) for rule, all_ in rules.items() for action, why in all_]
+        found += [Verdict(name, Action.LAND, "distance", why) for name, why in self._too_close(vehicles)]
+        silent = heartbeat_age if s.heartbeat_s and (heartbeat_age or 0.0) > s.heartbeat_s else None
+        if silent is not None and any(v.state in MAY_MOVE for v in vehicles):
+            why = f"no heartbeat of the ground station for {silent:.2f} s"
+            found.append(Verdict("", Action.STOP_ALL, "heartbeat", why))
+        fresh = [v for v in found if (v.name, v.rule, v.action) not in self._active]
+        self._active = {(v.name, v.rule, v.action) for v in found}
         return fresh
 
-    def _fence(self, v: Watched) -> list[Verdict]:
+    def _fence(self, v: Watched) -> Demands:
         s = self.settings
         if not s.geofence or v.state not in IN_AIR or v.position is None:
-            return []
+            return
         worst, axis = max(outside_by(v.position, s.geofence_min, s.geofence_max))
-        if worst <= s.geofence_tolerance_m:
-            return []
-        where = ", ".join(f"{p:.2f}" for p in v.position)
-        reason = f"{worst:.2f} m outside the geofence in {axis} at ({where})"
-        verdicts = [Verdict(v.name, Action.LAND, "geofence", reason)] if v.state != State.LANDING else []
-        if worst > s.geofence_hard_m:
-            verdicts.append(Verdict(v.name, Action.STOP, "geofence", reason))
-        return verdicts
+        reason = f"{worst:.2f} m outside the geofence in {axis} at {place_text(v.position)}"
+        if worst > s.geofence_tolerance_m and v.state != State.LANDING:
+            yield Action.LAND, reason
+        if worst > max(s.geofence_tolerance_m, s.geofence_hard_m):
+            yield Action.STOP, reason
 
-    def _battery(self, now: float, v: Watched) -> list[Verdict]:
-        verdicts = []
-        for level, limit, action in (
-            ("warning", v.battery_warning, Action.WARN),
-            ("critical", v.battery_critical, Action.LAND),
-        ):
-            key = (v.name, level)
-            if not self.settings.battery or v.state in (State.DISCONNECTED, State.CONNECTING) or v.battery >= limit:
+    def _battery(self, now: float, v: Watched) -> Demands:
+        for level, limit in (("warning", v.battery_warning), ("critical", v.battery_critical)):
+            key, warns = (v.name, level), level == "warning"
+            if not self.settings.battery or v.state in UNKNOWN or v.battery >= limit:
                 self._low_since.pop(key, None)
                 continue
-            since = self._low_since.setdefault(key, now)
-            if now - since >= self.settings.battery_s and (action is Action.WARN or v.state == State.FLYING):
+            low_s = now - self._low_since.setdefault(key, now)
+            if low_s >= self.settings.battery_s and (warns or v.state == State.FLYING):
                 reason = f"battery {v.battery:.2f} V, {level} limit {limit:.2f} V"
-                verdicts.append(Verdict(v.name, action, "battery", reason))
-        return verdicts
+                yield Action.WARN if warns else Action.LAND, reason
 
-    def _link(self, v: Watched) -> list[Verdict]:
+    def _link(self, v: Watched) -> Demands:
         limit = self.settings.link_age_s
-        if not limit or v.state in (State.DISCONNECTED, State.CONNECTING) or v.log_age <= limit:
-            return []
-        return [Verdict(v.name, Action.LOST, "link", f"no log packet for {v.log_age:.2f} s (limit {limit:.2f} s)")]
+        if limit and v.state not in UNKNOWN and v.log_age > limit:
+            yield Action.LOST, f"no log packet for {v.log_age:.2f} s (limit {limit:.2f} s)"
 
-    def _commands(self, v: Watched) -> list[Verdict]:
-        s = self.settings
-        return _waiting(v, v.command_age, s.command_age_s, s.command_land_s, "commands", "no command")
-
-    def _positions(self, v: Watched) -> list[Verdict]:
-        s = self.settings
-        what = "not seen by motion capture"
-        return _waiting(v, v.position_age, s.position_age_s, s.position_land_s, "positions", what)
-
-    def _estimate(self, v: Watched) -> list[Verdict]:
-        if not v.wrong or v.state not in IN_AIR:
-            return []
-        if v.state == State.LANDING:
-            return [Verdict(v.name, Action.LAND, "estimate", v.wrong)]
-        verdicts = [Verdict(v.name, Action.HOLD, "estimate", v.wrong)]
-        if v.wrong_s > ESTIMATE_HOLD_S:
-            verdicts.append(Verdict(v.name, Action.LAND, "estimate", v.wrong))
-        return verdicts
-
-    def _distance(self, vehicles: Sequence[Watched]) -> list[Verdict]:
+    def _too_close(self, vehicles: Sequence[Watched]) -> Iterator[tuple[str, str]]:
         limit = self.settings.min_distance_m
-        if not limit:
-            return []
-        flying = [v for v in vehicles if v.state in IN_AIR and v.position is not None]
-        verdicts = []
-        for i, a in enumerate(flying):
-            for b in flying[i + 1 :]:
-                distance = math.dist(a.position, b.position)  # type: ignore[arg-type]
-                if distance < limit:
-                    for one, other in ((a, b), (b, a)):
-                        reason = f"{distance:.2f} m from {other.name} (limit {limit:.2f} m)"
-                        if one.state == State.FLYING:
-                            verdicts.append(Verdict(one.name, Action.LAND, "distance", reason))
-        return verdicts
-
-    def _heartbeat(self, vehicles: Sequence[Watched], age: float | None) -> list[Verdict]:
-        limit = self.settings.heartbeat_s
-        if not limit or age is None or age <= limit:
-            return []
-        if not any(v.state in (State.ARMED, State.FLYING, State.LANDING, State.LOST) for v in vehicles):
-            return []
-        return [Verdict("", Action.STOP_ALL, "heartbeat", f"no heartbeat of the ground station for {age:.2f} s")]
+        flying = [(v, v.position) for v in vehicles if v.state in IN_AIR and v.position is not None]
+        for (a, here), (b, there) in combinations(flying if limit else (), 2):
+            if (distance := math.dist(here, there)) < limit:
+                for one, other in ((a, b), (b, a)):
+                    if one.state == State.FLYING:
+                        yield one.name, f"{distance:.2f} m from {other.name} (limit {limit:.2f} m)"
 
 
-def _waiting(v: Watched, age: float | None, hold_s: float, land_s: float, rule: str, what: str) -> list[Verdict]:
-    """What to do with one that flies and waits for something.
+def _estimate(v: Watched) -> Demands:
+    if v.wrong and v.state in IN_AIR:
+        if v.state != State.LANDING:
+            yield Action.HOLD, v.wrong
+        if v.state == State.LANDING or v.wrong_s > ESTIMATE_HOLD_S:
+            yield Action.LAND, v.wrong
 
-    :param age: s, since it came last; None: never.
-    :param hold_s: age at which it is held; 0: never. :param land_s: age at which it lands.
-    :param rule: the rule's name. :param what: what is missing.
-    """
-    if not hold_s or age is None or v.state != State.FLYING or age <= hold_s:
-        return []
-    reason = f"{what} for {age:.2f} s"
-    verdicts = [Verdict(v.name, Action.HOLD, rule, reason)]
-    if age > land_s:
-        verdicts.append(Verdict(v.name, Action.LAND, rule, reason))
-    return verdicts
+
+def _waits(v: Watched, age: float | None, hold_s: float, land_s: float, what: str) -> Demands:
+    """One that flies waits for something, since `age` (s; None: never): hold it (0 s: never), then land it."""
+    if hold_s and age is not None and v.state == State.FLYING and age > hold_s:
+        yield Action.HOLD, f"{what} for {age:.2f} s"
+        if age > land_s:
+            yield Action.LAND, f"{what} for {age:.2f} s"
 
 
 @dataclass(slots=True)

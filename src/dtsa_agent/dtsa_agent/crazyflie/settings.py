@@ -128,27 +128,20 @@ class StationSettings(Settings):
         maximum=1000,
     )
     room_origin_in_world: Vector = setting(
-        (0.0, 0.0, 0.95),
-        "where the Crazyflies' world sees the origin of the frame map, the room's centre",
-        unit="m",
+        (0.0, 0.0, 0.95), "where the Crazyflies' world sees the origin of the frame map, the room's centre", unit="m"
     )
     force_budget: bool = setting(False, "fly although the radios cannot carry it")
     toc_cache: str = setting("", "folder of the tables of variables; empty: ~/.cache/dtsa/crazyflie")
-    land_speed_mps: float = setting(
-        0.4, "mean speed of a landing without a duration", unit="m/s", minimum=0.05, maximum=2
-    )
-    max_speed_mps: float = setting(
-        1.2, "largest speed on the way of a take-off, a go_to or a landing", unit="m/s", minimum=0.1, maximum=10
-    )
-    max_stream_mps: float = setting(
-        3.0, "streamed commands that are faster are refused", unit="m/s", minimum=0.1, maximum=30
-    )
-    landing_timeout_s: float = setting(
-        20.0, "longest wait for all to land at the end", unit="s", minimum=1, maximum=300
-    )
-    priority: int = setting(
-        20, "real-time priority of bridge, agents and ground station, where allowed; 0: none", minimum=0, maximum=90
-    )
+    land_speed_mps: float = setting(0.4, "mean speed of a landing without a duration",
+        unit="m/s", minimum=0.05, maximum=2)  # fmt: skip
+    max_speed_mps: float = setting(1.2, "largest speed on the way of a take-off, a go_to or a landing",
+        unit="m/s", minimum=0.1, maximum=10)  # fmt: skip
+    max_stream_mps: float = setting(3.0, "streamed commands that are faster are refused",
+        unit="m/s", minimum=0.1, maximum=30)  # fmt: skip
+    landing_timeout_s: float = setting(20.0, "longest wait for all to land at the end",
+        unit="s", minimum=1, maximum=300)  # fmt: skip
+    priority: int = setting(20, "real-time priority of bridge, agents and ground station, where allowed; 0: none",
+        minimum=0, maximum=90)  # fmt: skip
     positions: PositionSettings = nested(PositionSettings, "positions from motion capture")
     on_board: OnBoardSettings = nested(OnBoardSettings, "Crazyflies that steer themselves by the app on board")
     safety: SafetySettings = nested(SafetySettings, "the safety rules")

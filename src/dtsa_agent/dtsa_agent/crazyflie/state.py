@@ -129,11 +129,7 @@ def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
     """
     x, y, z, w = -q[0], -q[1], -q[2], q[3]
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
-    return (
-        v[0] + w * tx + y * tz - z * ty,
-        v[1] + w * ty + z * tx - x * tz,
-        v[2] + w * tz + x * ty - y * tx,
-    )
+    return (v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx)
 
 
 def rotate(q: Quaternion, v: Vector) -> Vector:

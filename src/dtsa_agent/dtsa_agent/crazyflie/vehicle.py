@@ -17,18 +17,7 @@ from .onboard import ENABLE
 from .positions import EXTPOSE, Settling, Tracker
 from .safety import EstimateWatch, Watched, outside_fence
 from .settings import RobotSettings, StationSettings
-from .state import (
-    HL_ACTIVE,
-    IN_AIR,
-    IS_FLYING,
-    Quaternion,
-    State,
-    StateMachine,
-    Vector,
-    VehicleState,
-    to_map,
-    yaw_of,
-)
+from .state import HL_ACTIVE, IN_AIR, IS_FLYING, Quaternion, State, StateMachine, Vector, VehicleState, to_map, yaw_of
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
