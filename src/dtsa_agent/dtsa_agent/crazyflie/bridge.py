@@ -218,16 +218,22 @@ class Bridge:
             now = time.monotonic()
             self.slowest_tick = max(self.slowest_tick, now - last)
             last = now
-            vehicles = self.vehicles.values()
-            age = None if self._heartbeat is None else now - self._heartbeat
-            for verdict in self.monitor.check(now, [v.watched(now) for v in vehicles], age):
-                self._act(verdict, now)
-            for vehicle in vehicles:
-                vehicle.tick(now)
-            if now >= keep_alive:
-                keep_alive = now + 1.0 / WATCHDOG_HZ
-                for vehicle in vehicles:
-                    vehicle.keep_alive(now, self.settings.station.safety.emergency_watchdog)
+            feed = now >= keep_alive
+            keep_alive = now + 1.0 / WATCHDOG_HZ if feed else keep_alive
+            try:
+                self._apply_rules(now, feed)
+            except Exception as error:  # of one vehicle: the rules of the others must go on
+                self._log("error", f"safety: {type(error).__name__}: {error}")
+
+    def _apply_rules(self, now: float, feed: bool) -> None:
+        vehicles = self.vehicles.values()
+        age = None if self._heartbeat is None else now - self._heartbeat
+        for vehicle in vehicles if feed else ():
+            vehicle.keep_alive(now, self.settings.station.safety.emergency_watchdog)
+        for verdict in self.monitor.check(now, [v.watched(now) for v in vehicles], age):
+            self._act(verdict, now)
+        for vehicle in vehicles:
+            vehicle.tick(now)
 
     def _act(self, verdict: Verdict, now: float) -> None:
         level = "warn" if verdict.action in (Action.WARN, Action.HOLD) else "error"

@@ -8,8 +8,8 @@ a closed port for the end of the link. So here are drivers (`cflib.crtp.crtpdriv
 - A mailbox a Crazyflie has all commands in sequence, the newest set-point, the newest position, and requests that want
   an answer (parameters, logs). Sending never waits. Commands come first; the others take turns.
 - With safelink a bit tells a new packet from a repetition. A packet is repeated until it is acknowledged, set-points
-  and positions only as long as there is no newer one. While nothing is acknowledged, perhaps because only the
-  acknowledgements are missing, commands are sent with either bit, one after the other: one of them counts.
+  and positions only for a short while and as long as there is no newer one. While nothing is acknowledged, perhaps
+  because only the acknowledgements are missing, commands are sent with either bit, one after the other: one counts.
 - A link never ends by itself. A dongle that is pulled is named; once it is there again its links go on.
 
 Set-points of port 3, of which `close_link` sends one, never leave.
@@ -77,7 +77,7 @@ class Mailbox:
         self._lock = threading.Lock()
         self._commands: deque[tuple[bytes, float]] = deque(maxlen=MOST_COMMANDS)
         self._requests: deque[bytes] = deque()
-        self._newest: dict[str, bytes] = {}
+        self._newest: dict[str, tuple[bytes, float]] = {}
         self._turn = 0
         self.replaced = 0  # set-points that a newer one overtook
 
@@ -89,7 +89,7 @@ class Mailbox:
                 self._requests.append(packet)
             elif kind != COMMAND:
                 self.replaced += kind == SETPOINT and kind in self._newest
-                self._newest[kind] = packet
+                self._newest[kind] = packet, time.monotonic()
             elif start not in WATCHDOG or all(packet != waiting for waiting, _ in self._commands):
                 if start in EMERGENCY:
                     self._requests.clear()
@@ -101,16 +101,18 @@ class Mailbox:
     def take(self, kind: str = "") -> tuple[str, bytes] | None:
         """Return the next packet, of one kind or of any, and its kind; None: there is none."""
         with self._lock:
+            now = time.monotonic()
+            self._newest = {kind: both for kind, both in self._newest.items() if now - both[1] < DEAF_S}
             while self._commands and kind in ("", COMMAND):
                 packet, since = self._commands.popleft()
-                if time.monotonic() - since < COMMAND_LIFE_S or packet[1:2] == b"\x03":
+                if now - since < COMMAND_LIFE_S or packet[1:2] == b"\x03":
                     return COMMAND, packet
             for number in range(self._turn, self._turn + len(TURNS)):
                 turn = TURNS[number % len(TURNS)]
                 waits = self._requests if turn == REQUEST else turn in self._newest
                 if waits and kind in ("", turn):
                     self._turn = (number + 1) % len(TURNS)
-                    return turn, self._requests.popleft() if turn == REQUEST else self._newest.pop(turn)
+                    return turn, self._requests.popleft() if turn == REQUEST else self._newest.pop(turn)[0]
         return None
 
     def put_back(self, request: bytes) -> None:
@@ -234,10 +236,13 @@ class RadioDriver(_Driver):
         box, pending, both = self.mailbox, self._pending, False
         if pending is None:
             pending = box.take() or (EMPTY, NULL)
-        elif now - self.acknowledged > DEAF_S and (command := box.take(COMMAND)) is not None:
-            if pending[0] == REQUEST:
-                box.put_back(pending[1])
-            pending, both = command, True
+        elif now - self.acknowledged > DEAF_S:
+            if (command := box.take(COMMAND)) is not None:
+                if pending[0] == REQUEST:
+                    box.put_back(pending[1])
+                pending, both = command, True
+            elif pending[0] in (SETPOINT, POSITION):
+                pending = EMPTY, NULL  # too old
         elif pending[0] in (SETPOINT, POSITION):
             pending = box.take(pending[0]) or pending
         self._pending = pending

@@ -147,9 +147,11 @@ def test_an_order_ends_the_stream_and_an_emergency_stop_empties_the_box() -> Non
 def test_an_order_that_has_waited_for_long_takes_nobody_by_surprise(monkeypatch: pytest.MonkeyPatch) -> None:
     box = mailbox(GO_TO, STOP)
     box.put(LAND_ORDER)
+    old = mailbox(SETPOINT, POSITION, PARAMETER)
     later = time.monotonic() + 1.1
     monkeypatch.setattr(time, "monotonic", lambda: later)
     assert taken(box) == [STOP]
+    assert taken(old) == [PARAMETER]
     flood = mailbox(*(GO_TO + bytes((k,)) for k in range(200)))
     assert 0 < len(taken(flood)) < 50
 
