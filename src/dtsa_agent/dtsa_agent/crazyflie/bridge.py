@@ -81,10 +81,8 @@ class Bridge:
         require_cflib()
         self._ownership = Ownership((robot.name, robot.uri) for robot in settings.robots)
         self._log = log
-        cache = Path(
-            station.toc_cache or Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dtsa/crazyflie"
-        )
-        cache = cache.expanduser()
+        caches = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        cache = Path(station.toc_cache or caches / "dtsa/crazyflie").expanduser()
         cache.mkdir(parents=True, exist_ok=True)
         self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state) for r in settings.robots}
         self._prepare_boards()
@@ -143,9 +141,8 @@ class Bridge:
         with vehicle.lock:
             state, age = vehicle.state, vehicle.log_age(time.monotonic())
             if state == State.LOST and age < GROUNDED_S:
-                return (
-                    f"{name} may still be in the air: wait until it was silent for {GROUNDED_S:g} s (now {age:.1f} s)"
-                )
+                wait = f"wait until it was silent for {GROUNDED_S:g} s (now {age:.1f} s)"
+                return f"{name} may still be in the air: {wait}"
             if state not in (State.LOST, State.DISCONNECTED, State.EMERGENCY):
                 return f"{name} is {state.name.lower()}"
             vehicle.connect(partial(self._rejoin, name))
@@ -163,23 +160,14 @@ class Bridge:
 
         With more than one name, those that are not there are skipped: one missing drone must not ground the swarm.
         """
-        names = list(names)
-        problems = []
-        done = 0
-        for name in names:
-            vehicle = self.vehicles[name]
-            if len(names) > 1 and vehicle.state in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY, State.LOST):
-                problems.append(f"{name} skipped: {vehicle.standing}")
-                continue
-            problem = order(vehicle)
-            if problem:
-                problems.append(problem)
-            else:
-                done += 1
-        refused = [p for p in problems if " skipped: " not in p]
-        if problems:
-            self._log("warn", "; ".join(problems))
-        return done > 0 and not refused, "; ".join(problems)
+        vehicles = [self.vehicles[name] for name in names]
+        absent = [v for v in vehicles if len(vehicles) > 1 and v.state in (*OFF, State.EMERGENCY, State.LOST)]
+        given = [v for v in vehicles if v not in absent]
+        refused = [problem for v in given if (problem := order(v))]
+        text = "; ".join([*(f"{v.name} skipped: {v.standing}" for v in absent), *refused])
+        if text:
+            self._log("warn", text)
+        return len(given) > 0 and not refused, text
 
     def enough(self) -> str:
         """Why the swarm may not take off; empty if it may."""
@@ -236,22 +224,23 @@ class Bridge:
             vehicle.tick(now)
 
     def _act(self, verdict: Verdict, now: float) -> None:
-        level = "warn" if verdict.action in (Action.WARN, Action.HOLD) else "error"
-        self._log(level, f"{verdict.name or 'all'}: {verdict.rule}: {verdict.reason}: {verdict.action.value}")
-        if verdict.action is Action.STOP_ALL:
-            self.stop_all(verdict.reason)
+        action, reason = verdict.action, verdict.reason
+        level = "warn" if action in (Action.WARN, Action.HOLD) else "error"
+        self._log(level, f"{verdict.name or 'all'}: {verdict.rule}: {reason}: {action.value}")
+        if action is Action.STOP_ALL:
+            self.stop_all(reason)
+            return
+        vehicle = self.vehicles[verdict.name]
+        if action is Action.WARN:
+            vehicle.action = reason
+        elif action is Action.HOLD:
+            vehicle.hold(reason, stale=True, until_seen=verdict.rule == "positions")
+        elif action is Action.LAND:
+            vehicle.land(reason)
+        elif action is Action.LOST:
+            vehicle.lose(reason, now)
         else:
-            vehicle = self.vehicles[verdict.name]
-            if verdict.action is Action.WARN:
-                vehicle.action = verdict.reason
-            elif verdict.action is Action.HOLD:
-                vehicle.hold(verdict.reason, stale=True, until_seen=verdict.rule == "positions")
-            elif verdict.action is Action.LAND:
-                vehicle.land(verdict.reason)
-            elif verdict.action is Action.LOST:
-                vehicle.lose(verdict.reason, now)
-            elif verdict.action is Action.STOP:
-                vehicle.stop(verdict.reason)
+            vehicle.stop(reason)
 
     # -- the end ----------------------------------------------------------------------------------------------------
     def snapshots(self) -> list[Snapshot]:
@@ -293,10 +282,8 @@ class Bridge:
         self._guard.join(1.0)
         guarded = [v.name for v in self.vehicles.values() if v.guarded]
         if guarded:
-            self._log(
-                "info",
-                f"{', '.join(guarded)}: locked by the emergency watchdog within 1 s: restart before flying again",
-            )
+            why = "locked by the emergency watchdog within 1 s: restart before flying again"
+            self._log("info", f"{', '.join(guarded)}: {why}")
         with ThreadPoolExecutor(len(self.vehicles)) as pool:
             list(pool.map(lambda vehicle: vehicle.link.close(), self.vehicles.values()))
         self.radios.close()

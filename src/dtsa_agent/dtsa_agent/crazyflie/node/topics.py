@@ -331,14 +331,11 @@ class Outputs:
         self._counted[s.name] = s.sent, s.received
         volts = s.vehicle.battery if s.vehicle else 0.0
         message = interfaces.Status(
-            supervisor_info=s.vehicle.info & 0xFFFF if s.vehicle else 0,
-            battery_voltage=volts,
+            supervisor_info=s.vehicle.info & 0xFFFF if s.vehicle else 0, battery_voltage=volts, rssi=s.rssi,
             pm_state=LOW_POWER if s.vehicle and volts < self._critical[s.name] else 0,
-            rssi=s.rssi,
-            num_tx_unicast=s.sent - sent,
-            num_rx_unicast=s.received - received,
+            num_tx_unicast=s.sent - sent, num_rx_unicast=s.received - received,
             latency_unicast=min(round(s.latency_p99 * 1000), 0xFFFF),
-        )
+        )  # fmt: skip
         message.header.stamp, message.header.frame_id = stamp, FRAME
         return message
 
@@ -354,18 +351,12 @@ def state_message(s: Snapshot, stamp: Any) -> StateMessage:
     """Return a vehicle's state on the wire."""
     message = StateMessage(
         supervisor_info=s.vehicle.info & 0xFFFF if s.vehicle else 0,
-        battery_voltage=s.vehicle.battery if s.vehicle else 0.0,
-        rssi=s.rssi,
-        num_tx_unicast=s.sent,
-        num_rx_unicast=s.received,
-        state=int(s.state),
-        state_name=s.state.name.lower(),
-        link_quality=s.link_quality,
+        battery_voltage=s.vehicle.battery if s.vehicle else 0.0, rssi=s.rssi, link_quality=s.link_quality,
+        num_tx_unicast=s.sent, num_rx_unicast=s.received, latency_ms=s.latency_p99 * 1000,
         log_age=s.log_age if math.isfinite(s.log_age) else -1.0,
         command_age=s.command_age if math.isfinite(s.command_age) else -1.0,
-        latency_ms=s.latency_p99 * 1000,
-        reason=s.reason,
-    )
+        state=int(s.state), state_name=s.state.name.lower(), reason=s.reason,
+    )  # fmt: skip
     message.header.stamp, message.header.frame_id = stamp, FRAME
     return message
 
@@ -391,13 +382,9 @@ def diagnostic(s: Snapshot, now: float) -> DiagnosticStatus:
         values |= position_values(s.tracker, now)
         if level == DiagnosticStatus.OK and s.tracker.rate(now) == 0.0:
             level = DiagnosticStatus.WARN
-    return DiagnosticStatus(
-        level=level,
-        name=f"crazyflie_bridge: {s.name}",
-        message=s.state.name.lower(),
-        hardware_id=s.name,
-        values=[KeyValue(key=key, value=value) for key, value in values.items()],
-    )
+    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+    name = f"crazyflie_bridge: {s.name}"
+    return DiagnosticStatus(level=level, name=name, message=s.state.name.lower(), hardware_id=s.name, values=pairs)
 
 
 def position_values(tracker: Tracker, now: float) -> dict[str, str]:
