@@ -272,15 +272,14 @@ class Vehicle:
     def takeoff(self, height: float, duration: float) -> str:
         """Climb to a height (m above the floor) within a duration (s); one that arms itself need not be armed."""
         with self.lock:
-            if self.state == State.READY and self.machine.arms_itself and (problem := self.arm(True)):
-                return problem
-            if self.state not in WATCHED_OVER:
+            arms = self.state == State.READY and self.machine.arms_itself
+            if not arms and self.state not in WATCHED_OVER:
                 return f"{self.name} is {self.standing}, not armed"
             if self._watch.wrong:
                 return f"{self.name}: {self._watch.wrong}"
             if not math.isfinite(height):
                 return f"{self.name}: height {height} m is not finite"
-            on_ground, last = self.state == State.ARMED, self.last
+            on_ground, last = arms or self.state == State.ARMED, self.last
             critical = self.robot.battery.voltage_critical
             if on_ground and last is not None and last.battery < critical:
                 return f"{self.name}: battery {last.battery:.2f} V (voltage_critical is {critical:g} V)"
@@ -292,6 +291,8 @@ class Vehicle:
                 return f"{self.name}: the take-off to {problem}"
             if problem := too_short(duration, height - max(z, 0.0), self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
+            if arms and (problem := self.arm(True)):
+                return problem
             self.controls.overruled, self.controls.moved = False, True
             if self.station.on_board.on:  # the app had been overruled by the last landing: it has to be enabled anew
                 self.link.set_parameter(ENABLE, 0)

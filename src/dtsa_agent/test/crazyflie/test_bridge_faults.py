@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -143,6 +144,26 @@ def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> 
         pilot.logged("all: heartbeat: no heartbeat of the ground station")
         wait_for(lambda: any(e["state"] == "locked" for e in fleet.events(3, "state")), 3)
         assert fleet.state_event(3, "locked")["reason"] == "emergency stop"
+
+
+@pytest.mark.realtime
+def test_crazyswarm2s_voltages_count_on_the_ground_alone(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 2) as fleet:
+        data = settings(fleet, battery={"voltage_warning": 3.8, "voltage_critical": 3.7})  # of its stock file
+        fleet.fault("battery", 1, voltage=3.6)
+        with flight(data) as pilot:
+            assert pilot.bridge.connect() == []
+            one, two = pilot.bridge.vehicles.values()
+            assert re.match(r"cf1: battery 3\.[56]. V \(voltage_critical is 3\.7 V\)", one.takeoff(0.5, 2.0))
+            assert pilot.state(1) is State.READY  # nor is it armed
+            assert two.takeoff(0.5, 2.0) == ""
+            wait_for(lambda: pilot.state(2) is State.FLYING)
+            fleet.fault("battery", 2, voltage=3.6)
+            wait_for(lambda: two.last is not None and two.last.battery < 3.65)
+            time.sleep(1.5)  # longer than a rule about batteries waits
+            assert pilot.state(2) is State.FLYING
+            pilot.bridge.land_all("test over")
+            assert pilot.bridge.wait_landed(lambda: False) == []
 
 
 @pytest.mark.realtime
