@@ -122,7 +122,8 @@ class OdometryVehicle:
         """Why it was never known where the vehicle is; empty: it was."""
         if self._last is not None:
             return ""
-        return self.intake.last or f"none came on {self._settings.odometry_topic}"
+        refused = ", ".join(f"{number} refused ({reason})" for reason, number in self.intake.counts.items())
+        return refused or f"none came on {self._settings.odometry_topic}"
 
     def _fresh(self) -> tuple[float, Any, Any] | None:
         last = self._last
