@@ -17,10 +17,10 @@ from typing import IO, Any
 
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.node.bridge import Bridge
-from dtsa_agent.crazyflie.settings.config import parse_swarm
-from dtsa_agent.crazyflie.state import conversions
-from dtsa_agent.crazyflie.state.state_machine import State
+from dtsa_agent.crazyflie.bridge import Bridge
+from dtsa_agent.crazyflie.commands import velocity_world
+from dtsa_agent.crazyflie.settings import parse_swarm
+from dtsa_agent.crazyflie.state import State
 from dtsa_bench.crazyflies.simulated import send_fault
 from dtsa_bench.crazyflies.simulated.process import free_base_port
 from dtsa_bench.crazyflies.simulated.truth import read_truth
@@ -120,7 +120,7 @@ class Flight:
         while not self.stop.wait(0.02):
             for name, velocity in self.velocity.items():
                 if velocity is not None:
-                    self.bridge.vehicles[name].command(conversions.velocity_world(velocity, 0.0, time.monotonic()))
+                    self.bridge.vehicles[name].controls.command(velocity_world(velocity, 0.0, time.monotonic()))
 
     def take_off(self) -> None:
         """Arm, climb to the middle of the room, and begin to stream zero velocity."""

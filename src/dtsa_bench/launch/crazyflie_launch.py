@@ -1,7 +1,6 @@
 """Crazyflies: the bridge alone, for other nodes to fly them; or a whole recorded mission. With simulated ones, too.
 
 ``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm.yaml``
-``ros2 launch dtsa_bench crazyflie_launch.py config:=crazyflies.yaml interfaces:=crazyswarm2``
 ``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm.yaml mission:=true out:=mission_1``
 ``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm_simulated.yaml mission:=true simulated:=true``
 
@@ -23,9 +22,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.settings.config import load_swarm
+from dtsa_agent.crazyflie.settings import load_swarm
 
-CRAZYSWARM2 = "crazyswarm2"
 LAND_S = "60.0"  # from Ctrl-C until SIGTERM: all land first
 DTSA = [sys.executable, "-m", "dtsa_bench"]
 
@@ -50,12 +48,11 @@ def _processes(context: LaunchContext) -> list:
         fly = [*DTSA, "fly", "--backend", "cflib", "--config", config, "--domain", domain, "--out", out, *more]
         actions.append(ExecuteProcess(cmd=fly, output="screen", name="mission", sigterm_timeout=LAND_S, on_exit=over))
         return actions
-    interfaces = LaunchConfiguration("interfaces").perform(context)
     bridge = Node(
         package="dtsa_agent",
         executable="crazyflie_bridge",
-        name="crazyflie_server" if interfaces == CRAZYSWARM2 else "crazyflie_bridge",
-        parameters=[{"config": os.path.abspath(config), "interfaces": interfaces}],
+        name="crazyflie_server",
+        parameters=[{"config": os.path.abspath(config)}],
         output="screen",
         sigterm_timeout=LAND_S,
         on_exit=over,
@@ -66,16 +63,15 @@ def _processes(context: LaunchContext) -> list:
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` asks for."""
     yes_no = ["true", "false"]
-    choices = {"mission": yes_no, "simulated": yes_no, "interfaces": ["dtsa", CRAZYSWARM2]}
+    choices = {"mission": yes_no, "simulated": yes_no}
     described = {
         "config": "the swarm's YAML file",
         "mission": "fly a recorded mission",
         "simulated": "the Crazyflies are simulated ones",
-        "interfaces": "of the bridge: dtsa, or crazyswarm2 for its programs",
         "out": "directory for a mission's bag and results",
         "options": "further options of a mission, as `fly` has them",
     }
-    defaults = {"mission": "false", "simulated": "false", "interfaces": "dtsa", "out": "mission"}
+    defaults = {"mission": "false", "simulated": "false", "out": "mission"}
     arguments = [
         DeclareLaunchArgument(
             name,

@@ -25,7 +25,7 @@ from typing import Any
 from waiting import wait_for
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.crazyflie.settings.on_board import key_of
+from dtsa_agent.crazyflie.onboard import key_of
 from dtsa_bench.crazyflies.peer_lab import App, Laboratory, LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.laboratory import ADDRESS, TICK_NS
 from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard

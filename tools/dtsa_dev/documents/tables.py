@@ -23,10 +23,10 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Setting, Settings, settings_of
 from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, VehicleParams
-from dtsa_agent.crazyflie.positions.motion_capture import PositionSettings
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
-from dtsa_agent.crazyflie.settings.config import BatterySettings, RobotSettings, StationSettings
-from dtsa_agent.crazyflie.settings.on_board import OnBoardSettings
+from dtsa_agent.crazyflie.onboard import OnBoardSettings
+from dtsa_agent.crazyflie.positions import PositionSettings
+from dtsa_agent.crazyflie.safety import SafetySettings
+from dtsa_agent.crazyflie.settings import BatterySettings, RobotSettings, StationSettings
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 from dtsa_dev.records import EVIDENCE, read_record

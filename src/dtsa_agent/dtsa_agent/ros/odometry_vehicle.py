@@ -117,6 +117,14 @@ class OdometryVehicle:
         self._update()
         return self._fresh() is not None
 
+    @property
+    def never_seen(self) -> str:
+        """Why it was never known where the vehicle is; empty: it was."""
+        if self._last is not None:
+            return ""
+        refused = ", ".join(f"{number} refused ({reason})" for reason, number in self.intake.counts.items())
+        return refused or f"none came on {self._settings.odometry_topic}"
+
     def _fresh(self) -> tuple[float, Any, Any] | None:
         last = self._last
         return last if last is not None and time.monotonic() - last[0] < self._settings.stale_s else None
@@ -230,6 +238,8 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
     finally:
         if vehicle is not None:
             vehicle.close()
+    if vehicle is not None and vehicle.never_seen:
+        raise DtsaError(f"no odometry that can be used: {vehicle.never_seen}")
     if recorder is not None and recorder.failure:
         raise DtsaError(recorder.failure)
     return 0

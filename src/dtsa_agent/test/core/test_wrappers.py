@@ -12,7 +12,7 @@ from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
 from dtsa_agent.core.plugins.entry_points import PluginSwarm
 from dtsa_agent.core.settings.flight_models import VehicleParams
-from dtsa_agent.crazyflie.node.external_vehicles import HOLD_GAIN, HOLD_MPS, ExternalVehicles
+from dtsa_agent.crazyflie.node.agents_node import HOLD_GAIN, HOLD_MPS, ExternalVehicles
 
 KEY = bytes(range(16))
 DECIDED, FLOWN = ("chosen", "reason", "digest", "score"), ("position", "velocity", "command", "track")

@@ -1,14 +1,12 @@
-"""The bridge with Crazyswarm2's interfaces: its units, what is said without its messages, and a flight with them."""
+"""Integration: a flight as Crazyswarm2's programs fly, with its messages."""
 
 from __future__ import annotations
 
 import importlib.util
 import signal
-import sys
 import time
 from contextlib import closing
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -27,75 +25,10 @@ from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from std_srvs.srv import Empty  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
-from dtsa_agent.crazyflie.node import bridge_node  # noqa: E402
-from dtsa_agent.crazyflie.node.crazyswarm2 import NO_TRAJECTORIES, Answer, Crazyswarm2Inputs  # noqa: E402
-from dtsa_agent.crazyflie.node.inputs import Inputs  # noqa: E402
-from dtsa_bench.commands.cli import main  # noqa: E402
 from dtsa_bench.flights.domain import ros_domain  # noqa: E402
 
 pytestmark = pytest.mark.ros
 MESSAGES = importlib.util.find_spec("crazyflie_interfaces") is not None
-
-
-def bare(kind: type[Inputs]) -> Any:
-    inputs = kind.__new__(kind)
-    inputs._origin = (0.0, 0.0, 0.95)
-    return inputs
-
-
-def test_units_and_frames_are_those_of_its_server() -> None:
-    theirs, ours = bare(Crazyswarm2Inputs), bare(Inputs)
-    header = SimpleNamespace(frame_id="/world")
-    position = SimpleNamespace(header=header, x=1.0, y=2.0, z=0.5, yaw=90.0)
-    assert theirs._position(position, 0.0).arguments == pytest.approx((1.0, 2.0, 0.5, 90.0))  # degrees
-    velocity = SimpleNamespace(header=header, vel=Point(x=0.1), yaw_rate=45.0)
-    assert theirs._velocity_world(velocity, 0.0).arguments == pytest.approx((0.1, 0.0, 0.0, 45.0))  # degrees/s
-    twist = SimpleNamespace(linear=Point(x=0.3), angular=Point(x=0.1, y=0.2, z=0.3))
-    pose = SimpleNamespace(position=Point(x=1.0, z=0.5), orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0))
-    state = SimpleNamespace(header=header, pose=pose, twist=twist, acc=Point(z=1.0))
-    place, _, _, _, *rates = theirs._full_state(state, 0.0).arguments
-    assert place == (1.0, 0.0, 0.5)
-    assert rates == [0.1, 0.2, 0.3]  # rad/s
-    assert ours._full_state(state, 0.0).arguments[0] == (1.0, 0.0, 1.45)  # frame map, unless the header says world
-
-
-def test_the_command_says_it_to_the_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[list[str]] = []
-    monkeypatch.setattr(bridge_node, "main", lambda arguments: said.append(arguments) or 0)
-    config = tmp_path / "swarm.yaml"
-    config.write_text(yaml.safe_dump({"robots": {"cf1": {"uri": "udp://127.0.0.1:9001"}}}))
-    assert main(["bridge", "--config", str(config)]) == 0
-    assert main(["bridge", "--config", str(config), "--interfaces", "crazyswarm2"]) == 0
-    assert ["interfaces:=crazyswarm2" in arguments for arguments in said] == [False, True]
-
-
-def test_all_are_not_sent_to_one_place() -> None:
-    request = SimpleNamespace(relative=False)
-    answer = bare(Crazyswarm2Inputs)._go_to(["cf1", "cf2"], request, Answer())
-    assert (answer.success, answer.message) == (False, "a go_to of all must be relative: they would meet in one place")
-
-
-def test_without_its_messages_the_bridge_says_so_and_ends(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "crazyflie_interfaces", None)
-    config = tmp_path / "swarm.yaml"
-    config.write_text(yaml.safe_dump({"robots": {"cf1": {"uri": "udp://127.0.0.1:9001"}}}))
-    parameters = tmp_path / "parameters.yaml"  # as a launch file hands them over, with the node's name
-    asked = {"config": str(config), "interfaces": "crazyswarm2"}
-    parameters.write_text(yaml.safe_dump({"/crazyflie_server": {"ros__parameters": asked}}))
-    for given, words in (
-        (["-p", "interfaces:=crazyswarm2"], "crazyflie_interfaces"),
-        (["-r", "__node:=crazyflie_server", "--params-file", str(parameters)], "crazyflie_interfaces"),
-        (["-p", "interfaces:=other"], "one of dtsa, crazyswarm2"),
-        (["-p", "interfaces:=[1, 2]"], "one of dtsa, crazyswarm2"),
-    ):
-        arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config}", *given]
-        assert bridge_node.main(arguments) == 2
-        errors = capsys.readouterr().err.strip().splitlines()
-        assert len(errors) == 1
-        assert errors[0].startswith("crazyflie_bridge: interfaces: ")
-        assert words in errors[0]
 
 
 class Program(ServedNode):
@@ -131,7 +64,7 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
         for k, robot in enumerate(data["robots"].values()):
             robot["initial_position"] = [(1.2, -1.2)[k], 0.0, 0.0]
         config.write_text(yaml.safe_dump(data))
-        with bridge_process(domain, config, "interfaces:=crazyswarm2") as process, closing(Program(domain)) as program:
+        with bridge_process(domain, config) as process, closing(Program(domain)) as program:
             program.client(Empty, "/all/emergency")
             poses, status = program.listen(PoseStamped, "/cf1/pose"), program.listen(Status, "/cf1/status")
             # Parameters: of one, of all, of the robots; what cannot be is refused.
@@ -167,7 +100,7 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
             assert process.returncode == 0, output
             for words in (
                 "parameter cf1.params.ring.effect: ring.effect: 300 is not a whole number",
-                "nobody of cf1, cf2 is in a group of 4", f"order /cf1/upload_trajectory: {NO_TRAJECTORIES}",
-                f"order /all/start_trajectory: {NO_TRAJECTORIES}",
+                "nobody of cf1, cf2 is in a group of 4", "order /cf1/upload_trajectory",
+                "trajectories are not supported",
             ):  # fmt: skip
                 assert words in output

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -19,8 +20,9 @@ pytest.importorskip("cflib")
 from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, settings
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.state.state_machine import State
-from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
+from dtsa_agent.crazyflie.node.parameters import read_parameters
+from dtsa_agent.crazyflie.state import State
+from dtsa_agent.crazyflie.vehicle import Vehicle
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
@@ -145,6 +147,26 @@ def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> 
 
 
 @pytest.mark.realtime
+def test_crazyswarm2s_voltages_count_on_the_ground_alone(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 2) as fleet:
+        data = settings(fleet, battery={"voltage_warning": 3.8, "voltage_critical": 3.7})  # of its stock file
+        fleet.fault("battery", 1, voltage=3.6)
+        with flight(data) as pilot:
+            assert pilot.bridge.connect() == []
+            one, two = pilot.bridge.vehicles.values()
+            assert re.match(r"cf1: battery 3\.[56]. V \(voltage_critical is 3\.7 V\)", one.takeoff(0.5, 2.0))
+            assert pilot.state(1) is State.READY  # nor is it armed
+            assert two.takeoff(0.5, 2.0) == ""
+            wait_for(lambda: pilot.state(2) is State.FLYING)
+            fleet.fault("battery", 2, voltage=3.6)
+            wait_for(lambda: two.last is not None and two.last.battery < 3.65)
+            time.sleep(1.5)  # longer than a rule about batteries waits
+            assert pilot.state(2) is State.FLYING
+            pilot.bridge.land_all("test over")
+            assert pilot.bridge.wait_landed(lambda: False) == []
+
+
+@pytest.mark.realtime
 def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 4, "--protocol", "10", "--arming", "required") as fleet:
         data = settings(fleet, connect_attempts=2, connect_timeout_s=1.0)
@@ -205,7 +227,7 @@ def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_contro
 
 
 def check_parameters(one: Vehicle, two: Vehicle) -> None:
-    known = one.onboard.parameters()
+    known = read_parameters(one.link)
     assert (known["ring.effect"].value, known["hlCommander.vland"].value) == (6, 0.5)
     for name, value, problem in (
         ("ring.effect", 7, ""),
@@ -216,9 +238,9 @@ def check_parameters(one: Vehicle, two: Vehicle) -> None:
         ("firmware.modified", 1, "firmware.modified is read-only"),
     ):
         assert known[name].problem(value) == problem
-    one.onboard.set_parameter("ring.effect", 7)
-    wait_for(lambda: one.onboard.parameters()["ring.effect"].value == 7)
-    assert two.onboard.parameters()["ring.effect"].value == 6
+    one.link.set_parameter("ring.effect", 7)
+    wait_for(lambda: read_parameters(one.link)["ring.effect"].value == 7)
+    assert read_parameters(two.link)["ring.effect"].value == 6
 
 
 @pytest.mark.realtime

@@ -1,4 +1,4 @@
-"""Durations that no Crazyflie can keep: take-off and go_to are refused, a landing takes longer."""
+"""Integration: durations that no Crazyflie can keep: take-off and go_to are refused, a landing takes longer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.motion.limits import PEAK, shortest_s, too_short
+from dtsa_agent.crazyflie.controls import PEAK, shortest_s, too_short
 
 
 def test_the_shortest_duration_keeps_the_speed_of_the_firmwares_path() -> None:
@@ -42,8 +42,8 @@ def test_what_is_too_short_is_refused_and_motors_never_stop_between_a_stream_and
     pytest.importorskip("cflib")
     from bridge_helpers import fake_fleet, flight, settings
 
-    from dtsa_agent.crazyflie.state.conversions import velocity_world
-    from dtsa_agent.crazyflie.state.state_machine import State
+    from dtsa_agent.crazyflie.commands import velocity_world
+    from dtsa_agent.crazyflie.state import State
 
     with fake_fleet(tmp_path, 1) as fleet:
         with flight(settings(fleet, {"safety": {"link_age_s": 3.0, "geofence": False}})) as pilot:
@@ -52,7 +52,7 @@ def test_what_is_too_short_is_refused_and_motors_never_stop_between_a_stream_and
 
             def stream() -> None:
                 for _ in range(10):
-                    assert cf.command(velocity_world((0.1, 0.0, 0.0), 0.0, time.monotonic()))
+                    assert cf.controls.command(velocity_world((0.1, 0.0, 0.0), 0.0, time.monotonic()))
                     time.sleep(0.05)
 
             def reaches(height: float) -> None:

@@ -29,7 +29,7 @@ from std_srvs.srv import Empty, Trigger  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
 from dtsa_agent.crazyflie.node import bridge_node  # noqa: E402
-from dtsa_agent.crazyflie.state.state_machine import State  # noqa: E402
+from dtsa_agent.crazyflie.state import State  # noqa: E402
 from dtsa_bench.flights.domain import ros_domain  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
@@ -54,10 +54,9 @@ def up(graph: Graph) -> None:
     for prefix in ("/all", "/cf1", "/cf2", "/cf3"):
         for service in ("takeoff", "land", "go_to", "arm", "emergency", "notify_setpoints_stop"):
             assert f"{prefix}/{service}" in names
-    assert graph.call(Arm, "/all/arm", arm=True).success
-    wait_for(lambda: all(graph.state(k) == "armed" for k in (1, 2, 3)))
+    assert graph.call(Arm, "/all/arm", arm=True).success  # they are armed by then: a take-off may follow at once
     assert graph.call(Takeoff, "/all/takeoff", height=0.95, duration=Duration(sec=2)).success
-    wait_for(lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2]) < 0.1 for k in (1, 2, 3)))
+    wait_for(lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2] - 0.95) < 0.1 for k in (1, 2, 3)))
 
 
 def refused_commands(graph: Graph, k: int) -> int:
@@ -70,26 +69,26 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
     with swarm(tmp_path) as (fleet, process, graph):
         up(graph)
         odometry = graph.last["/cf1/odom"]
-        assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "cf1/base_link")
-        assert graph.last["/cf1/pose"].header.frame_id == "map"
+        assert (odometry.header.frame_id, odometry.child_frame_id) == ("world", "cf1/base_link")
+        assert graph.last["/cf1/pose"].header.frame_id == "world"
         x = graph.place(1)[0]
-        # go_to in the frame map; commands are not taken before it has been flown.
-        goal = Point(x=x - 0.3, y=0.2, z=0.1)
+        # go_to in the world; commands are not taken before it has been flown.
+        goal = Point(x=x - 0.3, y=0.2, z=1.05)
         assert graph.call(GoTo, "/cf1/go_to", goal=goal, duration=Duration(sec=1)).success
-        wait_for(lambda: graph.place(1) == pytest.approx((x - 0.3, 0.2, 0.1), abs=0.05))
+        wait_for(lambda: graph.place(1) == pytest.approx((x - 0.3, 0.2, 1.05), abs=0.05))
         # Streamed commands, with yaw: cf2 by velocity, cf1 by position.
         y = graph.place(2)[1]
         for _ in range(50):
-            message = VelocityWorld(yaw_rate=1.0)
+            message = VelocityWorld(yaw_rate=57.3)
             message.vel.y = -0.4
             graph.velocity[2].publish(message)
-            place = Position(x=x - 0.3, y=0.0, z=0.0, yaw=1.0)
+            place = Position(x=x - 0.3, y=0.0, z=0.95, yaw=57.3)
             graph.position.publish(place)
             time.sleep(0.02)
         assert graph.place(2)[1] < y - 0.2
         turned = graph.last["/cf2/odom"].pose.pose.orientation
         assert turned.z > 0.2  # counter-clockwise
-        assert graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.0), abs=0.15)
+        assert graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.95), abs=0.15)
         status = graph.last["/cf2/status"]
         assert status.supervisor_info & Status.SUPERVISOR_INFO_IS_FLYING
         assert 3.0 < status.battery_voltage < 4.2
@@ -98,7 +97,7 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         assert {"cf1", "cf2", "cf3"} == set(diagnostics)
         assert "battery [V]" in {v.key for v in diagnostics["cf1"].values}
         # Groups: nobody is in the fourth, cf3 alone is in the second.
-        here = Point(x=graph.place(3)[0], y=graph.place(3)[1], z=0.1)
+        here = Point(x=graph.place(3)[0], y=graph.place(3)[1], z=1.05)
         answer = graph.call(GoTo, "/all/go_to", group_mask=4, goal=here, duration=Duration(sec=1))
         assert (answer.success, answer.message) == (False, "nobody of cf1, cf2, cf3 is in a group of 4")
         before = len(fleet.events(1, "go_to")), len(fleet.events(3, "go_to"))
@@ -106,8 +105,10 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         wait_for(lambda: len(fleet.events(3, "go_to")) > before[1])
         assert len(fleet.events(1, "go_to")) == before[0]
         # Goals, heights and commands outside the fence, or faster than anybody means, are refused in so many words.
-        answer = graph.call(GoTo, "/cf3/go_to", goal=Point(x=1.95), duration=Duration(sec=5))
+        answer = graph.call(GoTo, "/cf3/go_to", goal=Point(x=1.95, z=0.95), duration=Duration(sec=5))
         assert "cf3: the goal (1.95, 0.00, 0.00) is 0.45 m outside the geofence in x" in answer.message
+        answer = graph.call(GoTo, "/all/go_to", goal=here, duration=Duration(sec=1))
+        assert answer.message == "a go_to of all must be relative: they would meet in one place"
         answer = graph.call(GoTo, "/cf3/go_to", relative=True, goal=Point(y=9.0), duration=Duration(sec=50))
         assert "outside the geofence in y" in answer.message
         answer = graph.call(Takeoff, "/cf3/takeoff", height=3.0, duration=Duration(sec=9))
@@ -198,7 +199,11 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
     config.write_text(yaml.safe_dump({"robots": {"cf1": {"uri": "udp://127.0.0.1:9"}}}))
     result = run_bridge("config:=/nowhere/swarm.yaml")
     assert (result.returncode, len(result.stderr.splitlines()), "config" in result.stderr) == (2, 1, True)
-    for words in ((f"config:={config}", "safety.heartbeat_s:=-1.0"), ("config=/nowhere/swarm.yaml",)):
+    for words in (
+        (f"config:={config}", "safety.heartbeat_s:=-1.0"),
+        (f"config:={config}", "safety.heart_beat_s:=1.0"),
+        ("config=/nowhere/swarm.yaml",),
+    ):
         result = run_bridge(*words)
         assert (result.returncode, "Traceback" in result.stderr) == (2, False)
         assert words[-1].partition(":=")[0] in result.stderr

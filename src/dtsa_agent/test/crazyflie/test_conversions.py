@@ -1,15 +1,17 @@
-"""Conversions between ROS and the Crazyflie's firmware, against golden values."""
+"""Integration: what goes to the Crazyflie's firmware and comes from it, against golden values."""
 
 from __future__ import annotations
 
 import math
 import struct
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_agent.crazyflie.state import conversions
+from dtsa_agent.crazyflie import commands
+from dtsa_agent.crazyflie import state as states
 
 finite = st.floats(-1e6, 1e6)
 vectors = st.tuples(finite, finite, finite)
@@ -21,15 +23,15 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 def test_log_block_fits_one_packet() -> None:
     size = struct.calcsize("<6hIHH")
-    assert size == conversions.LOG_BYTES <= 26
-    assert len(conversions.LOG_VARIABLES) == 9
+    assert size <= 26
+    assert len(states.LOG_VARIABLES) == 9
 
 
 def test_state_log_is_in_millimetres_and_millivolts() -> None:
-    numbers = dict.fromkeys(conversions.LOG_VARIABLES, 0.0) | {"stateEstimateZ.quat": 0xC0000000}
+    numbers = dict.fromkeys(states.LOG_VARIABLES, 0.0) | {"stateEstimateZ.quat": 0xC0000000}
     numbers |= {"pm.vbatMV": 3712, "supervisor.info": 0x1A}
     measured = {"x": 1234, "y": -2000, "z": 950, "vx": -1500, "vy": 20, "vz": 7}
-    state = conversions.decode_log(numbers | {f"stateEstimateZ.{name}": value for name, value in measured.items()})
+    state = states.decode_log(numbers | {f"stateEstimateZ.{name}": value for name, value in measured.items()})
     assert state.position == pytest.approx((1.234, -2.0, 0.95))
     assert state.velocity == pytest.approx((-1.5, 0.02, 0.007))
     assert state.battery == pytest.approx(3.712)
@@ -49,7 +51,7 @@ GOLDEN_QUATERNIONS = [
 
 @pytest.mark.parametrize(("bits", "expected"), GOLDEN_QUATERNIONS)
 def test_quaternion_golden_values(bits: int, expected: tuple[float, ...]) -> None:
-    assert conversions.decompress_quaternion(bits) == pytest.approx(expected, abs=1e-5)
+    assert states.decompress_quaternion(bits) == pytest.approx(expected, abs=1e-5)
 
 
 @settings(deadline=None)
@@ -57,7 +59,7 @@ def test_quaternion_golden_values(bits: int, expected: tuple[float, ...]) -> Non
 def test_quaternion_agrees_with_the_library(q: tuple[float, float, float, float]) -> None:
     encoding = pytest.importorskip("cflib.utils.encoding")
     bits = encoding.compress_quaternion(list(q))
-    ours = conversions.decompress_quaternion(bits)
+    ours = states.decompress_quaternion(bits)
     assert ours == pytest.approx(tuple(encoding.decompress_quaternion(bits)), abs=1e-9)
     norm = math.sqrt(sum(c * c for c in q))
     same = abs(sum(a * b / norm for a, b in zip(ours, q, strict=True)))  # q and -q are the same attitude
@@ -65,15 +67,33 @@ def test_quaternion_agrees_with_the_library(q: tuple[float, float, float, float]
 
 
 def test_yaw_of_streamed_commands_is_in_degrees() -> None:
-    assert conversions.velocity_world((0.5, -0.25, 0.125), math.pi / 2, 7.0).arguments == pytest.approx(
-        (0.5, -0.25, 0.125, 90.0)
-    )
-    assert conversions.position((1.0, 2.0, 3.0), -math.pi, 0.0).arguments == pytest.approx((1.0, 2.0, 3.0, -180.0))
-    assert conversions.velocity_world((0.0, 0.0, 0.0), 0.0, 7.0).stamp == 7.0
+    header = SimpleNamespace(frame_id="/world")
+    message = SimpleNamespace(header=header, x=1.0, y=2.0, z=0.5, yaw=90.0)
+    assert of_message(commands.POSITION, message).arguments == pytest.approx((1.0, 2.0, 0.5, 90.0))
+    message = SimpleNamespace(header=header, vel=SimpleNamespace(x=0.1, y=0.0, z=0.0), yaw_rate=45.0)
+    assert of_message(commands.VELOCITY_WORLD, message).arguments == pytest.approx((0.1, 0.0, 0.0, 45.0))
+    assert of_message(commands.VELOCITY_WORLD, message).stamp == 7.0
+
+
+def of_message(kind: str, message: object) -> commands.Setpoint:
+    return commands.of_message(kind, message, (0.0, 0.0, 0.95), 7.0)
+
+
+@pytest.mark.parametrize(("frame", "height"), [("map", 1.45), ("world", 0.5), ("", 0.5), ("/world", 0.5)])
+def test_places_are_in_the_world_unless_the_header_says_map(frame: str, height: float) -> None:
+    def vector(**values: float) -> SimpleNamespace:
+        return SimpleNamespace(**({"x": 0.0, "y": 0.0, "z": 0.0} | values))
+
+    pose = SimpleNamespace(position=vector(x=1.0, z=0.5), orientation=vector(w=1.0))
+    twist = SimpleNamespace(linear=vector(x=0.3), angular=vector(x=0.1, y=0.2, z=0.3))
+    message = SimpleNamespace(header=SimpleNamespace(frame_id=frame), pose=pose, twist=twist, acc=vector(z=1.0))
+    place, _, _, _, *rates = of_message(commands.FULL_STATE, message).arguments
+    assert place == (1.0, 0.0, height)
+    assert rates == [0.1, 0.2, 0.3]  # rad/s
 
 
 def test_full_state_is_in_rad_per_second_and_never_overflows() -> None:
-    setpoint = conversions.full_state(
+    setpoint = commands.full_state(
         (40.0, -40.0, 1.0), (1.0, 2.0, 3.0), (0.0, 0.0, 9.0), (0, 0, 2.0, 0), (0.1, 99.0, -0.2), 0
     )
     vectors = (32.767, -32.767, 1.0), (1.0, 2.0, 3.0), (0.0, 0.0, 9.0), (0, 0, 1.0, 0)
@@ -82,7 +102,7 @@ def test_full_state_is_in_rad_per_second_and_never_overflows() -> None:
 
 def test_full_state_without_attitude_means_level() -> None:
     zero = (0.0, 0.0, 0.0)
-    assert conversions.full_state(zero, zero, zero, (0.0, 0.0, 0.0, 0.0), zero, 0.0).arguments[3] == LEVEL
+    assert commands.full_state(zero, zero, zero, (0.0, 0.0, 0.0, 0.0), zero, 0.0).arguments[3] == LEVEL
 
 
 @settings(deadline=None)
@@ -98,7 +118,7 @@ def test_every_full_state_fits_its_packet(p, v, a, w) -> None:  # type: ignore[n
 
     radio = Radio()
     commander.Commander(radio).send_full_state_setpoint(
-        *conversions.full_state(p, v, a, (0.0, 0.0, 0.0, 1.0), w, 0.0).arguments
+        *commands.full_state(p, v, a, (0.0, 0.0, 0.0, 1.0), w, 0.0).arguments
     )
     kind, x, y, z, *_ = struct.unpack("<B9hI3h", bytes(radio.packet.data))  # type: ignore[attr-defined]
     assert kind == 6
@@ -109,17 +129,17 @@ def test_every_full_state_fits_its_packet(p, v, a, w) -> None:  # type: ignore[n
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_numbers_that_are_not_finite_are_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="finite"):
-        conversions.velocity_world((0.0, bad, 0.0), 0.0, 0.0)
+        commands.velocity_world((0.0, bad, 0.0), 0.0, 0.0)
     with pytest.raises(ValueError, match="finite"):
-        conversions.position((0.0, 0.0, 0.0), bad, 0.0)
+        commands.position((0.0, 0.0, 0.0), bad, 0.0)
 
 
 def test_map_is_the_middle_of_the_room_and_world_is_the_floor() -> None:
-    assert conversions.to_map((0.3, 0.0, 0.0), (0.0, 0.0, 0.95)) == (0.3, 0.0, -0.95)
-    assert conversions.to_world((0.3, 0.0, -0.95), (0.0, 0.0, 0.95)) == (0.3, 0.0, 0.0)
+    assert states.to_map((0.3, 0.0, 0.0), (0.0, 0.0, 0.95)) == (0.3, 0.0, -0.95)
+    assert states.to_world((0.3, 0.0, -0.95), (0.0, 0.0, 0.95)) == (0.3, 0.0, 0.0)
 
 
 def test_rotation_into_the_body() -> None:
     left = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # heading along y
-    assert conversions.rotate_inverse(left, (0.0, 1.0, 0.5)) == pytest.approx((1.0, 0.0, 0.5))
-    assert conversions.yaw_of(left) == pytest.approx(math.pi / 2)
+    assert states.rotate_inverse(left, (0.0, 1.0, 0.5)) == pytest.approx((1.0, 0.0, 0.5))
+    assert states.yaw_of(left) == pytest.approx(math.pi / 2)

@@ -17,11 +17,11 @@ import yaml
 from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.positions.estimates import EstimateWatch, Settling
-from dtsa_agent.crazyflie.positions.motion_capture import MOVED_AGAIN, PositionSettings, Tracker
-from dtsa_agent.crazyflie.settings.config import RobotSettings, StationSettings, parse_swarm
-from dtsa_agent.crazyflie.state.conversions import VehicleState
-from dtsa_agent.crazyflie.vehicle.known_state import KnownState
+from dtsa_agent.crazyflie.positions import MOVED_AGAIN, PositionSettings, Settling, Tracker
+from dtsa_agent.crazyflie.safety import EstimateWatch
+from dtsa_agent.crazyflie.settings import parse_swarm
+from dtsa_agent.crazyflie.state import VehicleState
+from dtsa_agent.crazyflie.vehicle import position_order
 
 ROOM = ((-1.5, -2.3, -0.95), (1.5, 2.3, 0.95))
 ORIGIN = (0.0, 0.0, 0.95)
@@ -49,7 +49,7 @@ def test_poses_that_cannot_be_are_refused_and_counted(pose: dict[str, Any], kind
     assert offer(t, (0.0, 0.0, 0.0), 1.0) == ""
     values = {"place": (0.0, 0.0, 0.0), "at": 1.01} | pose
     assert words in offer(t, values.pop("place"), values.pop("at"), **values)
-    assert (dict(t.refused), t.numbers(1.01).reason) == ({kind: 1}, t.reason)
+    assert (dict(t.refused), words in t.reason) == ({kind: 1}, True)
     assert t.last is not None
     assert (t.last.position, t.age(1.51)) == ((0.0, 0.0, 0.0), pytest.approx(0.51))
 
@@ -59,10 +59,11 @@ def test_frames_quaternions_and_the_rate() -> None:
     assert offer(t, (0.5, 0.0, -0.95), 1.0, frame="map", q=(0.0, 0.0, 0.0, 0.0)) == ""  # extpos needs no attitude
     assert t.last is not None
     assert (t.last.position, t.last.orientation) == (pytest.approx((0.5, 0.0, 0.0)), None)
-    assert offer(t, (0.5, 0.0, 0.0), 1.01, q=(0.0, 0.0, 0.0, 1.04)) == ""
-    assert t.last.orientation == (0.0, 0.0, 0.0, 1.0)
     assert sum(t.due(2.0 + 0.01 * k) for k in range(100)) == pytest.approx(50, abs=1)
     full = tracker(max_rate_hz=100)
+    assert offer(full, (0.5, 0.0, 0.0), 1.01, q=(0.0, 0.0, 0.0, 1.04)) == ""
+    assert full.last is not None
+    assert full.last.orientation == (0.0, 0.0, 0.0, 1.0)
     jitter = np.random.default_rng(1).uniform(-0.004, 0.004, 100)
     assert sum(full.due(2.0 + 0.01 * k + jitter[k]) for k in range(100)) > 90
 
@@ -84,7 +85,9 @@ def test_poses_that_come_late_are_not_believed() -> None:
     t = tracker()
 
     def at(stamp: float, arrival: float, *, flying: bool = True) -> str:
-        return t.offer((0.0, 0.0, 0.0), LEVEL, "world", 77000.0 + stamp, arrival, flying=flying)  # another clock
+        return t.offer(
+            (0.0, 0.0, 1e-4 * arrival), LEVEL, "world", 77000.0 + stamp, arrival, flying=flying
+        )  # another clock
 
     assert [at(0.01 * k, 5.004 + 0.01 * k) for k in range(20)] == [""] * 20
     backlog = [at(0.2 + 0.01 * k, 5.5 + 0.0005 * k) for k in range(28)]  # nothing for 0.3 s, then all at once
@@ -104,24 +107,51 @@ def test_latency_and_rate() -> None:
         offer(t, (0.0, 0.0, 0.0), 1.0 + 0.01 * k)
         assert t.last is not None
         t.was_sent(t.last, 1000.0 + 1.0 + 0.01 * k + 0.004)
-    numbers = t.numbers(2.495)
-    assert numbers.rate == pytest.approx(100, abs=1)
-    assert (numbers.latency_p50, numbers.latency_p99) == (pytest.approx(0.004), pytest.approx(0.004))
-    assert (numbers.sent, numbers.age) == (150, pytest.approx(0.005))
+    assert t.rate(2.495) == pytest.approx(100, abs=1)
+    assert (t.latency(0.5), t.latency(0.99)) == (pytest.approx(0.004), pytest.approx(0.004))
+    assert (t.sent, t.age(2.495)) == (150, pytest.approx(0.005))
+
+
+def test_a_pose_that_stands_still_in_flight_is_no_pose() -> None:
+    """Motion capture that repeats its last pose for two seconds, with new stamps."""
+    t = tracker()
+    assert offer(t, (0.0, 0.0, 1.0), 1.0, flying=True) == ""
+    answers = [offer(t, (0.0, 0.0, 1.0), 1.0 + 0.01 * k, flying=True) for k in range(1, 201)]
+    assert all("the same pose again" in answer for answer in answers)
+    assert (t.refused, t.age(3.0), t.place(3.0)) == ({"repeated": 200}, pytest.approx(2.0), None)
+    assert offer(t, (0.0, 0.0, 1.001), 3.01, flying=True) == ""
+    standing = tracker()
+    assert [offer(standing, (0.0, 0.0, 0.0), 1.0 + 0.01 * k) for k in range(20)] == [""] * 20
+
+
+@pytest.mark.parametrize(("q", "words"), [
+    ((1.0, 0.0, 0.0, 0.0), "tilted by 180 degrees"), ((0.0, 0.0, 1.0, 0.0), "turns by 180 degrees"),
+    ((0.0, 0.0, 0.05, 0.99875), ""), ((0.0, 0.0, -0.05, -0.99875), ""),
+])  # fmt: skip
+def test_attitudes_that_cannot_be_are_refused(q: Any, words: str) -> None:
+    t = tracker()
+    assert offer(t, (0.0, 0.0, 1.0), 1.0, flying=True) == ""
+    answer = offer(t, (0.0, 0.0, 1.001), 1.01, q=q, flying=True)
+    assert (answer == "") == (words == "")
+    assert words in answer
+    assert dict(t.refused) == ({"attitude": 1} if words else {})
+    places = tracker(send="extpos")
+    assert offer(places, (0.0, 0.0, 1.0), 1.0, flying=True) == ""
+    assert offer(places, (0.0, 0.0, 1.001), 1.01, q=q, flying=True) == ""  # attitudes are not sent
 
 
 def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None:
     pytest.importorskip("cflib")
-    from dtsa_agent.crazyflie.links.radio_link import packets_of
+    from cflib.crazyflie.localization import Localization
 
     for send, size, header in (("extpose", 29, 0x61), ("extpos", 12, 0x60)):
-        station = StationSettings(positions=PositionSettings(source="pose", send=send))
-        known = KnownState(RobotSettings(name="cf1", id=1, uri="udp://h:1"), station, lambda *line: None)
-        packet, captured = known.see((1.0, 2.0, 0.5), LEVEL, "world", 0.0), known.tracker
-        assert packet is not None
-        assert captured is not None
+        captured = tracker(send=send)
+        assert captured.offer((1.0, 2.0, 0.5), LEVEL, "world", 0.0, 100.0, flying=False) == ""
         assert captured.last is not None
-        (data,) = packets_of(SimpleNamespace(platform=None), packet.send) or []
+        sent: list[Any] = []
+        cf = SimpleNamespace(send_packet=sent.append, add_port_callback=lambda *_: None)
+        position_order(captured)(SimpleNamespace(loc=Localization(cf)))
+        data = bytes((sent[0].header,)) + bytes(sent[0].data)
         assert (len(data) - 1, data[0] & 0xF3, captured.sent) == (size, header, 1)
         soon, late = captured.last.time + 0.2, captured.last.time + 1.0
         assert captured.place(soon) == (1.0, 2.0, 0.5)
@@ -177,7 +207,7 @@ def test_jumps_standstill_and_errors_in_flight_are_noticed() -> None:
 
 def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rclpy")
-    from dtsa_agent.crazyflie.node.inputs import _named, named_pose_array
+    from dtsa_agent.crazyflie.node.topics import _named, named_pose_array
 
     assert PositionSettings(source="pose").topic_of("cf3") == "/cf3/pose"
     assert PositionSettings(source="named_poses").topic_of("cf3") == "/poses"
@@ -231,7 +261,9 @@ def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fail
                 assert graph.call(Arm, "/all/arm", arm=True).success
                 wait_for(lambda: all(graph.state(k) == "armed" for k in (1, 2, 3)))
                 assert graph.call(Takeoff, "/all/takeoff", height=0.95, duration=Duration(sec=2)).success
-                wait_for(lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2]) < 0.1 for k in (1, 2, 3)))
+                wait_for(
+                    lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2] - 0.95) < 0.1 for k in (1, 2, 3))
+                )
                 values = {v.key: v.value for v in graph.last["/diagnostics"].status[0].values}
                 assert float(values["positions [Hz]"]) > 60
                 assert 0.0 < float(values["position latency, median [ms]"]) < 50.0

@@ -102,6 +102,16 @@ def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_
         graph.until(lambda: len(vehicle.commands) > 1 and not np.any(vehicle.commands[-2:]), vehicle.act)
 
 
+def test_an_agent_that_never_had_odometry_says_so_and_fails(tmp_path: Path) -> None:
+    values = {"id": 1, "agents": 2, "air": "udp", "interface": "lo", "auth": "false", "vehicle": "odometry"}
+    with ros_graph(tmp_path) as graph:
+        words = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
+        process = graph.start(AGENT, *words, "-p", "duration_s:=1.5", logs=True)
+        code, said = end_of(process)
+        assert code == 1
+        assert "no odometry that can be used: none came on odom" in said
+
+
 def test_a_vehicle_that_has_to_hover_returns_to_where_that_began(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = OdometryVehicle.__new__(OdometryVehicle)
     vehicle._every, vehicle._hold, sent = 1, None, []

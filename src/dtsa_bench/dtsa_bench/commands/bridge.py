@@ -14,13 +14,17 @@ The bridge to the Crazyflies of a swarm.yaml: topics /cfN/..., services /cfN/...
 The first Ctrl-C lands all, the second stops all motors."""
 EXAMPLES = (
     ("--config swarm.yaml --check", "is everything there that a flight needs?"),
+    ("--places 10 > swarm.yaml", "a file to begin with: where ten begin, and rates for one dongle"),
     ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
-    parser.add_argument("--config", type=Path, required=True, help="swarm.yaml: robots, types, defaults, station")
+    parser.add_argument("--config", type=Path, help="swarm.yaml: robots, types, defaults, station")
+    parser.add_argument(
+        "--places", metavar="N", help="print a swarm.yaml for a mission of N on one dongle: places and rates; and end"
+    )
     parser.add_argument(
         "--backend",
         choices=("cflib", "sim"),
@@ -28,13 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="cflib: the Crazyflies of the file; sim: simulated ones in their place (default %(default)s)",
     )
     add_simulated_radio(parser)
-    parser.add_argument(
-        "--interfaces",
-        choices=("dtsa", "crazyswarm2"),
-        default="dtsa",
-        help="crazyswarm2: the node crazyflie_server with Crazyswarm2's messages, names and units, for its programs; "
-        "needs crazyflie_interfaces in the workspace (default %(default)s)",
-    )
     parser.add_argument(
         "--check",
         nargs="?",
@@ -57,7 +54,7 @@ def add_simulated_radio(parser: argparse._ActionsContainer) -> None:
 
 def use_simulated_radio(args: argparse.Namespace) -> None:
     """Tell this process and those that it starts."""
-    from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+    from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 
     if args.simulated_radio is not None:
         os.environ[SIMULATED_RADIO] = str(args.simulated_radio.resolve())
@@ -65,31 +62,38 @@ def use_simulated_radio(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the bridge until Ctrl-C."""
-    from dtsa_agent.crazyflie.links.link import require_cflib
-    from dtsa_agent.crazyflie.settings.config import load_swarm
-    from dtsa_agent.crazyflie.settings.radio_budget import check_budget, radio_loads
+    from dtsa_agent.core.errors import ConfigError
+    from dtsa_agent.crazyflie.addresses import check_budget
+    from dtsa_agent.crazyflie.link import require_cflib
+    from dtsa_agent.crazyflie.settings import load_swarm
+    from dtsa_bench.crazyflies.missions.places import example_swarm, place_lines
+    from dtsa_bench.runs.options import whole_number
 
+    if args.places is not None:
+        print(example_swarm(whole_number(args.places, "places", 1, 100)))
+        return 0
+    if args.config is None:
+        raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
     use_simulated_radio(args)
     settings = load_swarm(args.config)
+    if args.check is not None:
+        print("\n".join([f"{args.config}: {len(settings.robots)} Crazyflies", *settings.summary()]), flush=True)
+        for line in place_lines(settings):
+            print(f"for a mission: {line}", flush=True)
     if args.check == FILE:
-        loads = radio_loads(settings.radio_rates())
-        print(f"{args.config}: {len(settings.robots)} Crazyflies")
-        for load in loads:
-            print(load)
-        check_budget(loads, force=settings.station.force_budget)
+        check_budget(settings.loads, force=settings.station.force_budget)
         return 0
     require_cflib()
     with ExitStack() as stack:
         config = simulated(args.config, stack) if args.backend == "sim" else args.config
-        return run_bridge(config, interfaces=args.interfaces, check=args.check == ALL)
+        return run_bridge(config, check=args.check == ALL)
 
 
-def run_bridge(config: Path, *, interfaces: str = "dtsa", check: bool = False) -> int:
+def run_bridge(config: Path, *, check: bool = False) -> int:
     """The bridge in this process; `check`: only connect, and say what a flight would lack."""
     from dtsa_agent.crazyflie.node import bridge_node
 
     arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config.resolve()}"]
-    arguments += ["-p", f"interfaces:={interfaces}"] if interfaces != "dtsa" else []
     if check:
         # Too many for a radio is a line of the list here, not the end.
         arguments += ["--log-level", "error"]
@@ -104,7 +108,7 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     """
     import yaml
 
-    from dtsa_agent.crazyflie.settings.config import load_swarm
+    from dtsa_agent.crazyflie.settings import load_swarm
     from dtsa_bench.crazyflies.simulated.process import FIRST, FleetError, free_base_port, running_fleet
 
     data = yaml.safe_load(config.read_text(encoding="utf-8"))

@@ -183,7 +183,7 @@ def late_agents(text: str | None) -> dict[int, float]:
 def run_crazyflies(args: argparse.Namespace) -> int:
     """A mission; 1 when a vehicle cut the exchange short or agents did not hear each other, 130 when interrupted."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_agent.crazyflie.settings.config import load_swarm
+    from dtsa_agent.crazyflie.settings import load_swarm
 
     if args.config is None:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
@@ -191,7 +191,8 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     path = Path(args.config)
     settings = load_swarm(path)
     from dtsa_agent.ros.common.process.loop import Stop
-    from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies, mission_defaults
+    from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
+    from dtsa_bench.crazyflies.missions.places import mission_defaults
 
     if getattr(args, "run.mode") is None:
         setattr(args, "run.mode", "realtime")

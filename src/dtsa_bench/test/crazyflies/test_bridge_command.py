@@ -30,8 +30,9 @@ from ground_helpers import Bridge, running
 from node_helpers import ros_graph
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.settings.config import load_swarm
+from dtsa_agent.crazyflie.settings import load_swarm
 from dtsa_bench.commands.bridge import simulated
+from dtsa_bench.commands.cli import main
 from dtsa_bench.crazyflies.simulated import process as simulated_process
 from dtsa_bench.crazyflies.simulated.process import free_base_port
 
@@ -117,7 +118,7 @@ def launched(monkeypatch: pytest.MonkeyPatch, **arguments: str) -> list[SimpleNa
 
 def test_ctrl_c_in_a_launch_lands_simulated_ones_before_they_end(tmp_path, monkeypatch):
     config = swarm_yaml(tmp_path, "udp://127.0.0.1:{}", free_base_port(2))
-    words = {"config": str(config), "simulated": "true", "mission": "false", "interfaces": "dtsa"}
+    words = {"config": str(config), "simulated": "true", "mission": "false"}
     simulated, node = launched(monkeypatch, **words)
     with (
         ros_graph(tmp_path) as graph,
@@ -164,6 +165,30 @@ def test_check_lists_what_a_flight_lacks(tmp_path: Path) -> None:
         wrong = next(line[2] for line in lines if line[1] == "positions")
         assert float(wrong.split(", ")[3].split(" m ")[0]) == pytest.approx(1.83, abs=0.05)
         assert not [e for e in fleet.events(name="state") if e["state"] in ("flying", "locked")]
+
+
+def test_places_and_rates_for_a_mission_are_printed_and_all_that_are_wrong_are_named(tmp_path, capsys) -> None:
+    assert main(["bridge", "--places", "10"]) == 0
+    config = tmp_path / "swarm.yaml"
+    config.write_text(capsys.readouterr().out)
+    assert main(["bridge", "--config", str(config), "--check", "file"]) == 0
+    (_, budget) = capsys.readouterr().out.splitlines()
+    assert budget.startswith("radio 0: 10 Crazyflies")
+    assert budget.endswith(": fits")
+    robots = load_swarm(config).robots
+    assert (len(robots), robots[0].log_rate_hz) == (10, 15)
+    data = yaml.safe_load(config.read_text())
+    for robot in data["robots"].values():
+        del robot["initial_position"]
+    data["robots"]["cf10"]["role"] = "leader"
+    config.write_text(yaml.safe_dump(data))
+    assert main(["bridge", "--config", str(config), "--check", "file"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len([line for line in lines if line.startswith("for a mission: initial_position: cf")]) == 10
+    assert "not used: robots.cf10.role" in lines
+    assert main(["fly", "--backend", "cflib", "--config", str(config), "--out", str(tmp_path / "out")]) == 2
+    (error,) = capsys.readouterr().err.strip().splitlines()
+    assert all(f"cf{k} within 0.25 m of (" in error for k in range(1, 11))
 
 
 def test_a_closed_terminal_lands_all_and_sigterm_is_no_second_ctrl_c(tmp_path: Path) -> None:

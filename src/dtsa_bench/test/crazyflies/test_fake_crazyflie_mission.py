@@ -36,8 +36,8 @@ from waiting import wait_for
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.links.link import require_cflib
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import mission_problem
 from dtsa_bench.crazyflies.missions.mission_flight import MissionWatch
@@ -305,8 +305,12 @@ def test_without_cflib_the_bridge_says_how_to_get_it(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.realtime
 def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
+    """The vehicles have names of their own."""
     with fake_fleet(tmp_path, 2, *MIXED) as fleet:
         config = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45)
+        data = yaml.safe_load(config.read_text())
+        data["robots"] = {"north_7": data["robots"]["cf1"], "south": data["robots"]["cf2"]}
+        config.write_text(yaml.safe_dump(data, sort_keys=False))
         with mission("--config", str(config), "--out", str(tmp_path / "out")) as process:
             wait_for(lambda: streaming(fleet), 60)
             process.send_signal(signal.SIGINT)

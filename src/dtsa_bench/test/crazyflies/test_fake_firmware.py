@@ -10,7 +10,7 @@ from craft import Craft
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_agent.crazyflie.state.conversions import decompress_quaternion, yaw_of
+from dtsa_agent.crazyflie.state import decompress_quaternion, yaw_of
 from dtsa_bench.crazyflies.simulated import crtp, planner
 from dtsa_bench.crazyflies.simulated.estimate import attitude, compress, quaternion
 from dtsa_bench.crazyflies.simulated.firmware import FLY, OFF, Battery

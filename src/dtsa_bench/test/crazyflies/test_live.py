@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from live_helpers import LiveLaboratory, live_laboratory
 
-from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_bench.crazyflies.peer_lab import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
@@ -80,7 +80,7 @@ def test_a_dongle_in_sniffer_mode_hears_apps_and_they_hear_it(live: LiveLaborato
 CFLIB = """
 import sys, time
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.crazyflie.links.link import require_cflib
+from dtsa_agent.crazyflie.link import require_cflib
 require_cflib()
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig

@@ -27,7 +27,7 @@ from std_srvs.srv import Empty, SetBool
 from waiting import wait_for
 
 from dtsa_agent.core import SwarmConfig, make_scenario
-from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.keys import VARIABLE
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.log.agent_bag import read

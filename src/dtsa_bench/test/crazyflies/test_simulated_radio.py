@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from dtsa_agent.crazyflie.settings import radio_budget as budget
+from dtsa_agent.crazyflie import addresses as budget
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir

@@ -13,8 +13,7 @@ ROOT = Path(__file__).resolve().parents[4]
 PLACES = ("src/dtsa_agent", "src/dtsa_channel_sim", "src/dtsa_bench", "tools")
 WORKAROUNDS = ROOT / "src/dtsa_agent/dtsa_agent/ros/common/workarounds"
 OF_OTHERS = (  # what works around packages that are used in one place only
-    "src/dtsa_agent/dtsa_agent/crazyflie/links/radio_link.py",
-    "src/dtsa_agent/dtsa_agent/crazyflie/links/udp_link.py",
+    "src/dtsa_agent/dtsa_agent/crazyflie/drivers.py",
 )
 
 pytestmark = pytest.mark.skipif(not (ROOT / "conftest.py").exists(), reason="not in the source tree")

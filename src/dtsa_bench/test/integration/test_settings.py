@@ -16,8 +16,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, nested, setting, settings_of
 from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, AvoiderParams, FlightModel, VehicleParams
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
-from dtsa_agent.crazyflie.settings.config import parse_swarm
+from dtsa_agent.crazyflie.safety import SafetySettings
+from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_bench.crazyflies.simulated import FleetConfig
 from dtsa_bench.experiments import sweep as spec
 from dtsa_bench.experiments.sweep import RESERVED
@@ -148,7 +148,7 @@ ROBOTS = {
         "cf2": {"uri": "radio://0/80/2M/E7E7E7E702", "type": "small", "initial_position": [1, 2, 0.5]},
         "cf7": {"uri": "udp://127.0.0.1:19850", "reset_estimator": False},
     },
-    "robot_types": {"small": {"command_rate_hz": 20, "battery": {"voltage_warning": 3.6}}},
+    "robot_types": {"small": {"command_rate_hz": 20, "battery": {"flight_warning": 3.6}}},
     "all": {"firmware_params": {"stabilizer": {"estimator": 2}, "ctrlMel": {"kp_xy": 0.4}}},
     "station": {"min_connected": 2, "safety": {"geofence_max": [2, 3, 1], "heartbeat_s": 0}},
 }

@@ -158,7 +158,8 @@ def simulated_dongles(path: Path) -> list[SimulatedDongle]:
     except OSError as error:
         allowed = "the socket of a running `fake-crazyflie --simulated-radio SOCKET`"
         raise ConfigError("simulated_radio", str(path), allowed) from error
-    return [SimulatedDongle(path, k, version) for k, (version,) in enumerate(struct.iter_unpack(">H", answer))]
+    versions = enumerate(struct.iter_unpack(">H", answer))
+    return [SimulatedDongle(path, k, version) for k, (version,) in versions if version]  # 0: it is pulled
 
 
 def replace_real_dongles(path: Path) -> None:

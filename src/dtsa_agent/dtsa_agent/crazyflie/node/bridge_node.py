@@ -1,7 +1,7 @@
 """The bridge as a ROS node: `ros2 run dtsa_agent crazyflie_bridge --ros-args -p config:=swarm.yaml`.
 
 Topics and services have the names that Crazyswarm2's users know. The node is a thin shell: its start and end are here,
-what comes in and goes out is in `inputs` and `outputs`; everything that decides is in `bridge`, `vehicle` and `safety`.
+what comes in and goes out is in `topics`; everything that decides is in `bridge`, `vehicle` and `safety`.
 """
 
 from __future__ import annotations
@@ -23,31 +23,25 @@ from rclpy.node import Node
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import named
-from dtsa_agent.crazyflie.positions.motion_capture import PositionSettings
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
-from dtsa_agent.crazyflie.settings.config import SwarmSettings, load_swarm
-from dtsa_agent.crazyflie.state.state_machine import State
-from dtsa_agent.ros.common.graph.parameters import declare_settings
+from dtsa_agent.crazyflie.bridge import Bridge
+from dtsa_agent.crazyflie.commands import CommandThread
+from dtsa_agent.crazyflie.positions import PositionSettings
+from dtsa_agent.crazyflie.safety import SafetySettings
+from dtsa_agent.crazyflie.settings import load_swarm
+from dtsa_agent.crazyflie.state import State
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings
 from dtsa_agent.ros.common.process.loop import Serving
 from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
 from dtsa_agent.ros.common.process.priority import stay_on_one_processor, take_priority
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 
-from .bridge import Bridge
-from .command_thread import CommandThread
-from .inputs import Inputs, helper_node, subscribe_positions
-from .outputs import Outputs
+from .interfaces import NODE
 from .preflight import FAIL, preflight
+from .topics import Inputs, Outputs, helper_node, subscribe_positions
 
-DTSA, CRAZYSWARM2 = "dtsa", "crazyswarm2"
-NODES = {DTSA: "crazyflie_bridge", CRAZYSWARM2: "crazyflie_server"}  # by the interfaces that are offered
 STATUS_HZ = 5.0
 SETTLE_S = 1.2  # of a check before flight
 SWITCH_S = 0.0005
-INTERFACES_DESCRIPTOR = ParameterDescriptor(
-    description="whose messages, names and units: dtsa or crazyswarm2", read_only=True, dynamic_typing=True
-)
-
 
 Given = TypeVar("Given", SafetySettings, PositionSettings)
 
@@ -59,67 +53,38 @@ def settings_parameters(node: Node, name: str, given: Given) -> Given:
         return type(given)(**values)
 
 
-def wanted_interfaces(argv: Sequence[str]) -> str:
-    """Whose messages, names and units the command line asks for; it says so before the node has its name.
-
-    :raises ConfigError: nobody's.
-    """
-    if not any("interfaces" in argument or "params-file" in argument for argument in argv):
-        return DTSA
-    probe = Node(NODES[DTSA], enable_rosout=False, start_parameter_services=False)
-    try:
-        value = probe.declare_parameter("interfaces", DTSA, INTERFACES_DESCRIPTOR).value
-    finally:
-        probe.destroy_node()
-    if value not in tuple(NODES):
-        raise ConfigError("interfaces", value, "one of " + ", ".join(NODES))
-    return str(value)
-
-
 class BridgeNode(Node):
     """ROS side of the bridge.
 
     :param config: the swarm's YAML; None: the node's parameter `config`.
-    :param interfaces: whose messages, names and units: `DTSA` or `CRAZYSWARM2`.
-    :raises ConfigError: the configuration is not usable, or the messages are not there.
+    :raises ConfigError: the configuration is not usable, or a parameter is not known.
     """
 
-    def __init__(self, config: Path | None = None, interfaces: str = DTSA, **node_options: Any) -> None:
-        outputs, inputs = Outputs, Inputs
-        if interfaces == CRAZYSWARM2:
-            from .crazyswarm2 import Crazyswarm2Inputs, Crazyswarm2Outputs, load_interfaces
-
-            load_interfaces()
-            outputs, inputs = Crazyswarm2Outputs, Crazyswarm2Inputs
-        super().__init__(NODES[interfaces], enable_rosout=False, **node_options)
-        self.declare_parameter("interfaces", interfaces, INTERFACES_DESCRIPTOR)
-        given = self.declare_parameter(
-            "config", str(config or ""), ParameterDescriptor(description="the swarm's YAML file", read_only=True)
-        ).value
+    def __init__(self, config: Path | None = None, **node_options: Any) -> None:
+        super().__init__(NODE, enable_rosout=False, **node_options)
+        text = ParameterDescriptor(description="the swarm's YAML file", read_only=True)
+        given = self.declare_parameter("config", str(config or ""), text).value
         if not given:
             raise ConfigError("config", "", "the path of a swarm's YAML file")
         settings = load_swarm(Path(given))
         safety = settings_parameters(self, "safety", settings.station.safety)
         positions = settings_parameters(self, "positions", settings.station.positions)
+        check_parameters(self)
         station = dataclasses.replace(settings.station, safety=safety, positions=positions)
-        self.settings = SwarmSettings(settings.robots, station)
-        self.outputs = outputs(self, self.settings)
-        self._commands = helper_node(self, "commands")
-        self.command_thread = CommandThread(self._commands)
+        self.settings = dataclasses.replace(settings, station=station)
+        self.outputs = Outputs(self, self.settings)
         self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
-        self._inputs = inputs(self, self.bridge, self.command_thread, self.say)
-        self._cameras = helper_node(self, "positions") if positions.on else None
-        self.positions = CommandThread(self._cameras) if self._cameras is not None else None
+        self.command_thread = CommandThread(helper_node(self, "commands"))
+        self._inputs = Inputs(self, self.bridge, self.command_thread, self.say)
+        self.positions = CommandThread(helper_node(self, "positions")) if positions.on else None
         if self.positions is not None:
             subscribe_positions(self.positions, positions, self.bridge.vehicles)
 
     def close(self) -> None:
         """End of what this node added to itself."""
         self.command_thread.close()
-        self._commands.destroy_node()
-        if self.positions is not None and self._cameras is not None:
+        if self.positions is not None:
             self.positions.close()
-            self._cameras.destroy_node()
         self.destroy_node()
 
     def say(self, level: str, line: str) -> None:
@@ -230,7 +195,7 @@ def check_node(node: BridgeNode, say: Callable[[str], None]) -> int:
     node.bridge.connect(stop=interrupts.any)
     interrupts.wait(SETTLE_S)  # rates and qualities are counted over a second
     firmware = {v.name: v.link.firmware for v in node.bridge.vehicles.values() if v.link.firmware is not None}
-    findings = preflight(node.settings, node.bridge.snapshots(), firmware, problem)
+    findings = preflight(node.settings, node.bridge.snapshots(), firmware, node.bridge.radios, problem)
     node.bridge.close()
     for finding in findings:
         say(str(finding))
@@ -269,7 +234,7 @@ def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = r
         return 2
     node = None
     try:
-        node = BridgeNode(interfaces=wanted_interfaces(argv))
+        node = BridgeNode()
         code = use(node)
     except ConfigError as error:
         print(f"crazyflie_bridge: {error}", file=sys.stderr)

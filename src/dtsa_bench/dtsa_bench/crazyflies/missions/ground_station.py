@@ -12,7 +12,6 @@ import numpy as np
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from dtsa_msgs.msg import Status
-from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff
 from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
@@ -21,10 +20,10 @@ from std_msgs.msg import Empty as EmptyMessage
 from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.crazyflie.motion.limits import shortest_s
-from dtsa_agent.crazyflie.node.agents_node import STOP_HERE
-from dtsa_agent.crazyflie.node.outputs import EVENTS, EVENTS_QOS
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.controls import shortest_s
+from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS, STATE, STOP_HERE, Arm, GoTo, Land, Takeoff
+from dtsa_agent.crazyflie.settings import SwarmSettings
+from dtsa_agent.crazyflie.state import to_map, to_world
 from dtsa_agent.ros.common.process.loop import Serving
 from dtsa_agent.stop import StopToken
 
@@ -38,6 +37,7 @@ BRIDGE_SILENT_S = 3.0
 STOPPING_S = (1.2, 6.0)  # all come to rest within the first time; at the second they land wherever they are
 IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
 BRIDGE_S = 60.0  # s, for the connections
+AGENTS_S = 60.0  # s, for their process
 
 
 class Mission:
@@ -55,7 +55,7 @@ class Mission:
         self.bridge_alive: Callable[[], None] = lambda: None
         self._odometry: list[Any] = []
         for robot in settings.robots:
-            node.create_subscription(Status, f"/{robot.name}/status", self._keep_status(robot.name), 10)
+            node.create_subscription(Status, f"/{robot.name}/{STATE}", self._keep_status(robot.name), 10)
             subscription = node.create_subscription(Odometry, f"/{robot.name}/odom", self._keep_place(robot.name), 1)
             self._odometry.append(subscription)
         node.create_subscription(DiagnosticArray, "/diagnostics", self.log.diagnostic, 10)
@@ -94,7 +94,7 @@ class Mission:
     def _keep_place(self, name: str) -> Callable[[Odometry], None]:
         def keep(message: Odometry) -> None:
             p = message.pose.pose.position
-            self.place[name] = p.x, p.y, p.z
+            self.place[name] = to_map((p.x, p.y, p.z), self.settings.station.room_origin_in_world)
 
         return keep
 
@@ -188,6 +188,20 @@ class Mission:
         check_crossings(self.scenario, vehicles, measured)
         return assigned
 
+    def wait_for_agents(self, alive: Callable[[], None]) -> None:
+        """Wait until the agents' process offers commands for all vehicles.
+
+        :param alive: raises an error when the process has died.
+        :raises MissionError: it does not in time.
+        """
+        topics = [f"/{robot.name}/cmd_velocity_world" for robot in self.settings.robots]
+
+        def offered() -> bool:
+            alive()
+            return all(self.node.count_publishers(topic) for topic in topics)
+
+        self.wait("the agents' start", offered, AGENTS_S)
+
     def take_off(self) -> None:
         """Arm, climb to the middle of the room, go to the start."""
         self.say("arming")
@@ -204,7 +218,8 @@ class Mission:
         way = max(math.dist(start, self.place[r.name]) for r, start in zip(self.settings.robots, starts, strict=True))
         seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))  # for all: their ways keep apart if flown together
         for robot, start in zip(self.settings.robots, starts, strict=True):
-            goal = Point(x=start[0], y=start[1], z=start[2])
+            x, y, z = to_world(tuple(start), self.settings.station.room_origin_in_world)
+            goal = Point(x=x, y=y, z=z)
             self.call(f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
         self.wait("the way to the start", self._at_start, seconds + 15.0)
         time.sleep(0.5)  # the last go_to is flown to its end before streamed commands count

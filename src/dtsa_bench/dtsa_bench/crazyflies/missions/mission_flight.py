@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -18,14 +17,14 @@ from rclpy.node import Node
 from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.station import check_slotted
-from dtsa_agent.crazyflie.links.link import require_cflib
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import to_parameters
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.process.priority import give_way, take_priority
+from dtsa_agent.ros.common.process.priority import give_way, leave_that_processor, take_priority
 from dtsa_agent.stop import StopToken
 from dtsa_bench.flights.children import Children, NodeError, describe_end
 from dtsa_bench.flights.domain import LAST_DOMAIN, ros_domain
@@ -50,18 +49,6 @@ from .places import APART_M, MissionError, check_places
 
 RECORDER_END_S = 10.0
 BRIDGE_END_S = 40.0  # s, to land by itself and close the links
-
-
-def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of the swarm that a mission chooses unless the user does.
-
-    The paper's room: an ellipse of half axes 1.2 m and 2.0 m, ids in order, so that everyone finds its place. More room
-    between two vehicles than in simulation, because they know where they are to a few centimetres only; and the policy
-    with which tables agree even where frames are lost.
-    """
-    room = {"shape": "ellipse", "axis_x_m": 1.2, "axis_y_m": 2.0, "permute": False}
-    defaults = {"agents": len(settings.robots), "avoider": "crazyflie", "policy": "lease"} | room
-    return {name: value for name, value in defaults.items() if given.get(name) is None}
 
 
 class MissionWatch(ChannelObserver):
@@ -111,20 +98,44 @@ class _Station:
                               ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
 
     def take_off(self, run: RunConfig, scenario: Scenario, domain: int, ended: StopToken) -> tuple[RunConfig, Mission]:
-        """Connect all vehicles and bring them into the air, at their places; the run with these places, the mission."""
+        """Connect all vehicles, start the agents, and bring the vehicles into the air, at their places.
+
+        Nothing of ours keeps the bridge waiting: it runs before all others, on a processor of its own, and what takes
+        a processor for seconds, as the start of the agents' process does, is over before a motor turns.
+
+        :returns: the run with these places, the mission.
+        """
+        leave_that_processor()
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
         mission = self._mission = Mission(node, self.settings, scenario, ended, self.progress.show)
         mission.bridge_alive = mission.check_bridge if self._attach else self.bridge.check
         mission.start()
-        take_priority(self.settings.station.priority)
+        take_priority(below(self.settings.station.priority, 1))
         mission.connect()
         swarm = mission.find_places(run.swarm)
         if swarm != run.swarm:
             self.progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
             run = dataclasses.replace(run, swarm=swarm)
+        self.progress.show("agents")
+        self._start_agents(run)
+        mission.wait_for_agents(self.agents.check)
         mission.take_off()
         return run, mission
+
+    def _start_agents(self, run: RunConfig) -> None:
+        settings, parameters = self.settings, self._directory / "parameters.yaml"
+        own = {
+            "command_hz": float(max(robot.command_rate_hz for robot in settings.robots)),
+            "priority": below(settings.station.priority, 2),
+            "vehicles": " ".join(robot.name for robot in settings.robots),
+            "origin": list(settings.station.room_origin_in_world),
+        }
+        content = {"/**": {"ros__parameters": to_parameters(run.swarm.to_dict(), SwarmConfig) | own}}
+        parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        self.agents.start("agents", list(range(1, run.swarm.agents + 1)), "dtsa_agent.crazyflie.node.agents_node",
+                          ["--ros-args", "--params-file", str(parameters), "--disable-external-lib-logs",
+                           "--disable-rosout-logs"])  # fmt: skip
 
     def end(self, ended: StopToken) -> None:
         """All land, agents before; then the bridge ends, then the recorder closes its bag."""
@@ -192,7 +203,6 @@ def fly_crazyflies(
         station.start(swarm_yaml)
         try:
             run, mission = station.take_off(run, scenario, domain, ended)
-            _start_agents(station.agents, run, settings, directory)
             flight = _exchange(station, run, directory, options, ended, mission)
             return flight, ended.reason
         except DtsaError as error:
@@ -216,16 +226,9 @@ def _second_interrupt() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, old)
 
 
-def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, directory: Path) -> None:
-    parameters = directory / "parameters.yaml"
-    content = {"/**": {"ros__parameters": to_parameters(run.swarm.to_dict(), SwarmConfig)}}
-    parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    rate = max(robot.command_rate_hz for robot in settings.robots)
-    ids = list(range(1, run.swarm.agents + 1))
-    agents.start("agents", ids, "dtsa_agent.crazyflie.node.agents_node",
-                 ["--ros-args", "--params-file", str(parameters), "-p", f"command_hz:={float(rate)}",
-                  "-p", f"priority:={settings.station.priority}",
-                  "--disable-external-lib-logs", "--disable-rosout-logs"])  # fmt: skip
+def below(priority: int, steps: int) -> int:
+    """A real-time priority below the bridge's; 0: none."""
+    return max(priority - steps, min(priority, 1))
 
 
 def _exchange(

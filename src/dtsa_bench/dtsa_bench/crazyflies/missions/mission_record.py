@@ -26,7 +26,7 @@ from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.crazyflie.node.outputs import EVENTS, EVENTS_QOS
+from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS
 from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
 from dtsa_agent.ros.common.process.priority import give_way_by
 from dtsa_bench.log.bag.writer import BagWriter

@@ -54,11 +54,7 @@ class Laboratory:
     """
 
     def __init__(
-        self,
-        app: App,
-        settings: LabSettings | None = None,
-        out: Path | None = None,
-        observers: Sequence[Observer] = (),
+        self, app: App, settings: LabSettings | None = None, out: Path | None = None, observers: Sequence[Observer] = ()
     ) -> None:
         self.settings = settings = settings or LabSettings()
         self.app = app

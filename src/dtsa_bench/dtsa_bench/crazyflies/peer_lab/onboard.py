@@ -15,7 +15,7 @@ from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.settings.on_board import KEY_BYTES, PORT, START, check_on_board, orders, parameters
+from dtsa_agent.crazyflie.onboard import KEY_BYTES, PORT, START, check_on_board, orders, parameters
 from dtsa_bench.log.agent_bag import AgentRecorder
 
 from .app import App, LabSettings, read_app

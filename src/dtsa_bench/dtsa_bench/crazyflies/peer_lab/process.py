@@ -13,7 +13,7 @@ from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.crazyflie.settings.on_board import key_of
+from dtsa_agent.crazyflie.onboard import key_of
 
 from .app import App, LabSettings, read_app
 from .compiling import CompileError, sanitizer_environment

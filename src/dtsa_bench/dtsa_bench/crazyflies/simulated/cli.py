@@ -65,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument("--rate", type=float, help="drop: share of the datagrams that is lost")
     faults.add_argument("--direction", choices=("up", "down", "both"), help="drop: up is from the host")
     faults.add_argument("--distance", type=float, help="estimate_jump: m")
+    faults.add_argument("--dongle", type=int, help="unplug: number of the dongle")
     faults.add_argument("--voltage", type=float, help="battery: V")
     faults.add_argument("--seconds", type=float, help="heals by itself after that long")
 
@@ -86,7 +87,7 @@ def fleet_config(args: argparse.Namespace) -> FleetConfig:
 def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
     import numpy as np
 
-    from dtsa_agent.crazyflie.settings.config import load_swarm
+    from dtsa_agent.crazyflie.settings import load_swarm
 
     robots = load_swarm(path).robots
     start = np.array([robot.initial_position for robot in robots]).T

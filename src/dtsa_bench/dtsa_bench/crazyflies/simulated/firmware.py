@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from dtsa_agent.crazyflie.state.conversions import decompress_quaternion, yaw_of
+from dtsa_agent.crazyflie.state import decompress_quaternion, yaw_of
 
 from .planner import DISABLED, Goal, Planner, Triple
 from .supervisor import LEVEL_OUT, Supervisor

@@ -25,7 +25,7 @@ from .process import check_fault
 from .truth import TruthLog
 from .world import TICK_S, World
 
-NUMBERS = ("rate", "direction", "voltage", "distance", "seconds")
+NUMBERS = ("rate", "direction", "voltage", "distance", "dongle", "seconds")
 MAX_LAG_S = 0.5  # a machine that lags further behind skips time, and the record says so
 
 
@@ -291,6 +291,8 @@ class Fleet:
         elif name == "battery":
             motors = firmware.supervisor.motors_allowed and firmware.supervisor.flying
             firmware.battery.force(request.get("voltage", 3.0), motors=motors)
+        elif name == "unplug" and self.radio is not None:
+            self.radio.unplug(request.get("dongle", 0))
         elif name in ("heal", "reboot"):
             self._heal(index)
             if name == "reboot":
@@ -304,6 +306,8 @@ class Fleet:
         link.drop_up = link.drop_down = 0.0
         link.frozen = False
         link.heal_at = None
+        if self.radio is not None:
+            self.radio.plug_in()
         if link.socket is None and self.radio is None:
             link.socket = self._bind(self.config.base_port + index)
             self._selector.register(link.socket, selectors.EVENT_READ, index)

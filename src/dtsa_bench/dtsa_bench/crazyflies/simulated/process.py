@@ -98,6 +98,7 @@ FAULTS = {
     "estimate_jump": "the estimate is this far (distance, m, default 2) from the truth along x",
     "estimate_freeze": "the estimate does not change any more",
     "battery": "show this voltage (V, default 3.0)",
+    "unplug": "a simulated dongle (number, default 0) is pulled",
     "heal": "all of the above is over; a fallen Crazyflie is put upright",
     "reboot": "power off and on: everything is forgotten, also an emergency stop",
 }
@@ -120,6 +121,7 @@ def check_fault(request: dict[str, Any], count: int) -> tuple[str, list[int]]:
         ("rate", 0.0, 1.0),
         ("voltage", 2.0, 4.3),
         ("distance", -10.0, 10.0),
+        ("dongle", 0, 15),
         ("seconds", 0.0, 1e6),
     ):
         value = request.get(name)

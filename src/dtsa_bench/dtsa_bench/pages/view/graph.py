@@ -191,7 +191,7 @@ class VehicleWatch:
 
     def __init__(self, node: Node, intake: Intake, history: RunHistory, prefix: str = "") -> None:
         self._node, self._intake, self._history = node, intake, history
-        self._topic = re.compile(f"{re.escape(prefix)}/([A-Za-z][A-Za-z0-9_]{{0,40}})/{names.STATUS}")
+        self._topic = re.compile(f"{re.escape(prefix)}/([A-Za-z][A-Za-z0-9_]{{0,40}})/(?:{names.STATUS}|state)")
         self._vehicles: dict[str, _Vehicle] = {}
         self._search_s = 0.0
         self.answer = ""  # result of the last command

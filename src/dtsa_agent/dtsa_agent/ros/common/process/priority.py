@@ -51,6 +51,13 @@ def stay_on_one_processor() -> None:
     _for_all_threads(lambda task: os.sched_setaffinity(task, {last}))
 
 
+def leave_that_processor() -> None:
+    """Keeps all threads of this process, and all that they start, off the processor on which a bridge stays."""
+    allowed = os.sched_getaffinity(0)
+    if len(allowed) > 1:
+        _for_all_threads(lambda task: os.sched_setaffinity(task, allowed - {max(allowed)}))
+
+
 def _for_all_threads(act: Callable[[int], None]) -> None:
     for task in Path("/proc/self/task").iterdir():
         with contextlib.suppress(ProcessLookupError):  # a thread that has ended meanwhile

@@ -4,7 +4,7 @@ A host connects with one socket a dongle. Messages are whole (SOCK_SEQPACKET); t
 
 | kind | from the host | answer |
 |---|---|---|
-| 0 list | | one pair of bytes a dongle: version of its firmware |
+| 0 list | | one pair of bytes a dongle: version of its firmware; 0: it is pulled |
 | 1 claim | number of the dongle | 1, or 0: it is in use |
 | 2 request | number, value (2), index (2), data | |
 | 3 packet | the packet | status and payload; nothing without acknowledgements |
@@ -37,7 +37,7 @@ _LONGEST = 128
 _PATIENCE_S = 0.05
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Host:
     """A host's connection."""
 
@@ -80,6 +80,8 @@ class RadioSide:
             for k in range(1, first)
         ]
         self._taken: set[int] = set()
+        self._gone: set[int] = set()  # dongles that are pulled
+        self._hosts: list[Host] = []
         if listen:
             self.listen()
 
@@ -102,7 +104,8 @@ class RadioSide:
             with contextlib.suppress(OSError):
                 connection = self.listener.accept()[0]
                 connection.setblocking(False)
-                selector.register(connection, selectors.EVENT_READ, Host(connection))
+                self._hosts.append(Host(connection))
+                selector.register(connection, selectors.EVENT_READ, self._hosts[-1])
             return
         sock = host.socket
         if not self._serve(host):
@@ -121,7 +124,9 @@ class RadioSide:
             return False
         kind = message[0]
         if kind == LIST:
-            _send(host, struct.pack(">H", DEVICES[self.settings.device]) * len(self.dongles))
+            version = DEVICES[self.settings.device]
+            versions = [0 if k in self._gone else version for k in range(len(self.dongles))]
+            _send(host, struct.pack(f">{len(versions)}H", *versions))
         elif kind == CLAIM and len(message) == 2:
             _send(host, bytes((self._claim(host, message[1]),)))
         elif host.dongle is not None:
@@ -129,7 +134,7 @@ class RadioSide:
         return True
 
     def _claim(self, host: Host, number: int) -> bool:
-        if number >= len(self.dongles) or number in self._taken:
+        if number >= len(self.dongles) or number in self._taken | self._gone:
             return False
         self._taken.add(number)
         host.dongle = number
@@ -148,9 +153,23 @@ class RadioSide:
         elif kind == DROPPED:
             _send(host, struct.pack("<BI", DROPPED, dongle.sniffer.dropped))
 
+    def unplug(self, number: int) -> None:
+        """Pull a dongle, of whoever has it."""
+        self._gone.add(number)
+        for host in self._hosts:
+            if host.dongle == number:
+                with contextlib.suppress(OSError):
+                    host.socket.shutdown(socket.SHUT_RDWR)  # `take` sees it go
+
+    def plug_in(self) -> None:
+        """All dongles are there."""
+        self._gone.clear()
+
     def leave(self, host: Host) -> None:
         """A host goes; its dongle is free again."""
         host.socket.close()
+        if host in self._hosts:
+            self._hosts.remove(host)
         if host.dongle is not None:
             self._taken.discard(host.dongle)
             self.dongles[host.dongle].reset()

@@ -6,7 +6,8 @@ The app is in `dtsa_agent/onboard`; what its parameters and orders mean stands i
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,8 @@ from dtsa_agent.core.settings.declaration import Settings, check, setting
 from dtsa_agent.core.settings.scenario import Scenario, policy_key
 from dtsa_agent.keys import VARIABLE, authenticator, check_session
 
+from .addresses import LinkError
+
 MOST = 20  # agents: BOARD_AGENTS of board.h
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")  # numbers of libdtsa
 ESTIMATORS = ("hold", "linear")
@@ -30,6 +33,9 @@ START = b"S"
 #: Named as that of a computer with a Crazyradio: they are on one air, and datagrams begin alike.
 PORT = PortProperties("crazyradio", FLIGHT_US * 1000, 0, agreed_bytes=2, peers=0, longest=60, bare_sealed=True)
 _MARGIN_M = 0.8  # of the box around all places
+_ANSWER_S = 0.5  # longest wait for the answer to an order
+_TIMES = 4  # that an order is sent
+_SET_S = 5.0  # longest wait until all parameters are confirmed
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,3 +125,73 @@ def orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[byt
     if swarm.auth:
         found.append(b"K" + key + struct.pack("<Q", swarm.auth_session))
     return found
+
+
+class BoardOrders:
+    """For one Crazyflie; called in its link's worker, on the ground.
+
+    :param parameters: values of the app's parameters, `group.name`.
+    :param orders: packets of the app channel before the start.
+    :param polls_hz: Hz, how often the Crazyflie is asked once its agent has started.
+    """
+
+    def __init__(self, parameters: Mapping[str, float], orders: Sequence[bytes], polls_hz: float) -> None:
+        self._parameters, self._orders = dict(parameters), tuple(orders)
+        self.polls_hz = polls_hz
+
+    def prepare(self, cf: Any) -> None:
+        """Everything that the app has to know before its agent starts.
+
+        :raises LinkError: it has no such app, or the app refuses.
+        """
+        missing, confirmed = set(self._parameters), threading.Event()
+
+        def note(name: str, value: str) -> None:
+            missing.discard(name)
+            if not missing:
+                confirmed.set()
+
+        for name, value in self._parameters.items():
+            cf.param.add_update_callback(*name.split("."), cb=note)
+            try:
+                cf.param.set_value(name, value)
+            except (KeyError, AttributeError) as error:
+                raise LinkError(f"parameter {name} of the app on board: {error}") from error
+        if not confirmed.wait(_SET_S):
+            raise LinkError(f"not confirmed: {', '.join(sorted(missing))}")
+        for name in self._parameters:
+            cf.param.remove_update_callback(*name.split("."), cb=note)
+        for order in self._orders:
+            _tell(cf, order)
+
+    def start(self, cf: Any) -> None:
+        """Its agent starts: it listens, then takes part.
+
+        :raises LinkError: it does not.
+        """
+        _tell(cf, START)
+
+
+def _tell(cf: Any, order: bytes) -> None:
+    answers: list[bytes] = []
+    answered = threading.Event()
+
+    def hear(data: Any) -> None:
+        if bytes(data)[:1] == order[:1]:
+            answers.append(bytes(data))
+            answered.set()
+
+    cf.appchannel.packet_received.add_callback(hear)
+    try:
+        for _ in range(_TIMES):
+            cf.appchannel.send_packet(order)
+            if answered.wait(_ANSWER_S):
+                break
+    finally:
+        cf.appchannel.packet_received.remove_callback(hear)
+    if not answers:
+        raise LinkError(f"the app on board does not answer order {order[:1].decode()}")
+    if answers[0][1:2] != b"\x01":
+        raise LinkError(
+            f"the app on board refuses order {order[:1].decode()}: {answers[0][2:].decode(errors='replace')}"
+        )

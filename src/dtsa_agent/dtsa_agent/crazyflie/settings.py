@@ -3,7 +3,7 @@
 robots:
   cf1: {uri: radio://0/80/2M/E7E7E7E701, initial_position: [1.2, 0.0, 0.0], type: cf21}
 robot_types:
-  cf21: {battery: {voltage_warning: 3.4, voltage_critical: 3.2}}
+  cf21: {battery: {flight_warning: 3.4, flight_landing: 3.2}}
 all:
   firmware_params: {stabilizer: {estimator: 2}}
 station:
@@ -22,45 +22,49 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting
+from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting, settings_of
 from dtsa_agent.core.settings.scenario import make_scenario
-from dtsa_agent.crazyflie.positions.motion_capture import NONE, PositionSettings
-from dtsa_agent.crazyflie.safety.rules import SafetySettings
-from dtsa_agent.crazyflie.state.conversions import Vector
 
-from .on_board import OnBoardSettings, check_on_board
-from .radio_budget import radio_of
+from .addresses import Address, RadioLoad, RadioUser, check_distinct, parse_address, radio_loads
+from .onboard import OnBoardSettings, check_on_board
+from .positions import NONE, PositionSettings
+from .safety import SafetySettings
+from .state import Vector
 
-NAME = re.compile(r"^[A-Za-z][A-Za-z0-9_]*?(\d+)$")
-CHANNEL = re.compile(r"radio://[^/]+/(\d+)")
-PORT = re.compile(r"udp://.*:(\d+)$")
-LAST_CHANNEL, LAST_PORT = 125, 65535
+NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+NUMBER = re.compile(r"\d+$")
 PLACE_M = 0.25  # m: an agent on board may stand this far beside its place
 SECTIONS = ("fileversion", "robots", "robot_types", "all", "station")
-# Keys that Crazyswarm2's files have and that mean nothing here: its files can be used as they are.
-IGNORED = frozenset({"motion_capture", "big_quad", "reference_frame", "broadcasts", "marker", "firmware_logging"})
 
 
 @dataclass(frozen=True, slots=True)
 class BatterySettings(Settings):
-    """Voltages of a battery in flight."""
+    """Voltages of a battery: Crazyswarm2's two on the ground, two of this bridge in flight."""
 
-    voltage_warning: float = setting(3.4, "warning below this", unit="V", minimum=2.0, maximum=5.0)
-    voltage_critical: float = setting(3.2, "landing below this", unit="V", minimum=2.0, maximum=5.0)
+    voltage_warning: float = setting(3.4, "on the ground: warning below this", unit="V", minimum=2.0, maximum=5.0)
+    voltage_critical: float = setting(3.2, "on the ground: no take-off below this", unit="V", minimum=2.0, maximum=5.0)
+    flight_warning: float = setting(3.4, "in flight: warning below this", unit="V", minimum=2.0, maximum=5.0)
+    flight_landing: float = setting(3.2, "in flight: landing below this", unit="V", minimum=2.0, maximum=5.0)
 
     def __post_init__(self) -> None:
         check(self)
-        if self.voltage_critical > self.voltage_warning:
-            allowed = f"at most voltage_warning, {self.voltage_warning} V"
-            raise ConfigError("voltage_critical", self.voltage_critical, allowed)
+        for low, high in (("voltage_critical", "voltage_warning"), ("flight_landing", "flight_warning")):
+            if getattr(self, low) > getattr(self, high):
+                raise ConfigError(low, getattr(self, low), f"at most {high}, {getattr(self, high)} V")
+
+
+BATTERY_KEYS = frozenset(spec.name for spec in settings_of(BatterySettings))
 
 
 @dataclass(frozen=True, slots=True)
 class RobotSettings(Settings):
     """One Crazyflie."""
 
-    name: str = setting(REQUIRED, "key of the robot: letters, then the agent's id")
-    id: int = setting(REQUIRED, "the agent's id: the digits that end its name", minimum=1, maximum=65534)
+    name: str = setting(REQUIRED, "key of the robot")
+    id: int = setting(
+        REQUIRED, "the agent's id; left out: the numbers that end all names, if they are 1 to N, else the file's order",
+        minimum=1, maximum=65534,
+    )  # fmt: skip
     uri: str = setting(REQUIRED, "the Crazyflie's address, such as radio://0/80/2M/E7E7E7E701", custom=True)
     enabled: bool = setting(True, "false: it takes no part")
     type: str = setting("", "one of robot_types; the robot takes over its values")
@@ -104,9 +108,13 @@ class RobotSettings(Settings):
     def __post_init__(self) -> None:
         check(self)
         object.__setattr__(self, "uri", str(self.uri))
-        radio_of(self.uri)
-        _check_numbers(self.uri)
+        parse_address(self.uri)
         object.__setattr__(self, "firmware_params", _params(self.firmware_params))
+
+    @property
+    def address(self) -> Address:
+        """Where it is reached."""
+        return parse_address(self.uri)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,27 +128,20 @@ class StationSettings(Settings):
         maximum=1000,
     )
     room_origin_in_world: Vector = setting(
-        (0.0, 0.0, 0.95),
-        "where the Crazyflies' world sees the origin of the frame map, the room's centre",
-        unit="m",
+        (0.0, 0.0, 0.95), "where the Crazyflies' world sees the origin of the frame map, the room's centre", unit="m"
     )
     force_budget: bool = setting(False, "fly although the radios cannot carry it")
     toc_cache: str = setting("", "folder of the tables of variables; empty: ~/.cache/dtsa/crazyflie")
-    land_speed_mps: float = setting(
-        0.4, "mean speed of a landing without a duration", unit="m/s", minimum=0.05, maximum=2
-    )
-    max_speed_mps: float = setting(
-        1.2, "largest speed on the way of a take-off, a go_to or a landing", unit="m/s", minimum=0.1, maximum=10
-    )
-    max_stream_mps: float = setting(
-        3.0, "streamed commands that are faster are refused", unit="m/s", minimum=0.1, maximum=30
-    )
-    landing_timeout_s: float = setting(
-        20.0, "longest wait for all to land at the end", unit="s", minimum=1, maximum=300
-    )
-    priority: int = setting(
-        20, "real-time priority of bridge, agents and ground station, where allowed; 0: none", minimum=0, maximum=90
-    )
+    land_speed_mps: float = setting(0.4, "mean speed of a landing without a duration",
+        unit="m/s", minimum=0.05, maximum=2)  # fmt: skip
+    max_speed_mps: float = setting(1.2, "largest speed on the way of a take-off, a go_to or a landing",
+        unit="m/s", minimum=0.1, maximum=10)  # fmt: skip
+    max_stream_mps: float = setting(3.0, "streamed commands that are faster are refused",
+        unit="m/s", minimum=0.1, maximum=30)  # fmt: skip
+    landing_timeout_s: float = setting(20.0, "longest wait for all to land at the end",
+        unit="s", minimum=1, maximum=300)  # fmt: skip
+    priority: int = setting(20, "real-time priority of bridge, agents and ground station, where allowed; 0: none",
+        minimum=0, maximum=90)  # fmt: skip
     positions: PositionSettings = nested(PositionSettings, "positions from motion capture")
     on_board: OnBoardSettings = nested(OnBoardSettings, "Crazyflies that steer themselves by the app on board")
     safety: SafetySettings = nested(SafetySettings, "the safety rules")
@@ -152,6 +153,7 @@ class SwarmSettings:
 
     robots: tuple[RobotSettings, ...]  # the enabled ones, by id
     station: StationSettings
+    unused: tuple[str, ...] = ()  # keys of the file that mean nothing here
 
     @property
     def swarm(self) -> SwarmConfig | None:
@@ -167,10 +169,23 @@ class SwarmSettings:
             check_on_board(swarm)
             return swarm
 
-    def radio_rates(self) -> list[tuple[str, str, float, float]]:
-        """Name, URI, packets/s to and log packets/s from each robot: what `radio_loads` counts."""
+    @property
+    def loads(self) -> list[RadioLoad]:
+        """What radios and channels have to carry."""
         positions = self.station.positions.max_rate_hz if self.station.positions.on else 0.0
-        return [(r.name, r.uri, r.command_rate_hz + positions, r.log_rate_hz) for r in self.robots]
+        return radio_loads(
+            RadioUser(r.name, r.address, r.command_rate_hz + positions, r.log_rate_hz) for r in self.robots
+        )
+
+    def summary(self) -> list[str]:
+        """What the file asks for, in lines: radios, and keys that mean nothing here."""
+        lines = [str(load) for load in self.loads]
+        wired = sum(not robot.address.radio for robot in self.robots)
+        if wired:
+            lines.append(f"{wired} Crazyflies without a radio (udp, usb): no budget")
+        if self.unused:
+            lines.append(f"not used: {', '.join(self.unused)}")
+        return lines
 
 
 def load_swarm(path: Path) -> SwarmSettings:
@@ -189,32 +204,29 @@ def parse_swarm(data: object) -> SwarmSettings:
     :raises ConfigError: something in it is not usable.
     """
     top = _mapping("config", data)
-    for key in top:
-        if key not in SECTIONS and key not in IGNORED:
-            raise ConfigError(f"config.{key}", top[key], "one of " + ", ".join(SECTIONS))
+    unused = [str(key) for key in top if key not in SECTIONS]
     types = _mapping("robot_types", top.get("robot_types"))
     common = _mapping("all", top.get("all"))
-    robots = []
+    enabled = {}
     for name, own in _mapping("robots", top.get("robots")).items():
-        robots.append(_robot(str(name), _mapping(f"robots.{name}", own), types, common))
-    robots = sorted((r for r in robots if r.enabled), key=lambda r: r.id)
-    if not robots:
-        raise ConfigError("robots", [], "at least one robot that is enabled")
-    numbers: dict[int, str] = {}
-    uris: dict[str, str] = {}
-    for robot in robots:
-        link = robot.uri.partition("?")[0]
-        if link in uris:
-            raise ConfigError(f"robots.{robot.name}.uri", robot.uri, f"a URI of its own ({uris[link]} has it)")
-        uris[link] = robot.name
-        if robot.id in numbers:
-            raise ConfigError(f"robots.{robot.name}", robot.id, f"a number of its own ({numbers[robot.id]} has it)")
-        numbers[robot.id] = robot.name
+        values = _mapping(f"robots.{name}", own)
+        if values.get("enabled", common.get("enabled", True)) is not False:
+            enabled[str(name)] = values
+    if not enabled:
+        raise ConfigError("robots", list(top.get("robots") or ()), "at least one robot that is enabled")
+    merged = {name: _merged(name, own, types, common, unused) for name, own in enabled.items()}
+    ids = _ids(merged)
+    robots = []
+    for name, own in merged.items():
+        with named(f"robots.{name}"):
+            robots.append(build(RobotSettings, own | {"name": name, "id": ids[name]}))
+    robots.sort(key=lambda robot: robot.id)
+    check_distinct([(robot.name, robot.address) for robot in robots])
     with named("station"):
-        station = StationSettings.from_dict(_used(_mapping("station", top.get("station"))))
+        station = StationSettings.from_dict(_given(_mapping("station", top.get("station"))))
     if station.min_connected > len(robots):
         raise ConfigError("station.min_connected", station.min_connected, f"1 to {len(robots)}, the enabled robots")
-    settings = SwarmSettings(tuple(robots), station)
+    settings = SwarmSettings(tuple(robots), station, tuple(dict.fromkeys(unused)))
     if (swarm := settings.swarm) is not None:
         _check_swarm(settings, swarm)
     return settings
@@ -249,18 +261,6 @@ def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
             raise ConfigError(f"robots.{robot.name}.initial_position", list(place), allowed)
 
 
-def _check_numbers(uri: str) -> None:
-    """Channel and port of an address.
-
-    :raises ConfigError: there is no such channel or port.
-    """
-    channel, port = CHANNEL.match(uri), PORT.match(uri)
-    if channel is not None and int(channel[1]) > LAST_CHANNEL:
-        raise ConfigError("uri", uri, f"a channel from 0 to {LAST_CHANNEL}")
-    if port is not None and not 1 <= int(port[1]) <= LAST_PORT:
-        raise ConfigError("uri", uri, f"a port from 1 to {LAST_PORT}")
-
-
 def _mapping(field: str, value: object) -> dict[str, Any]:
     if value is None:
         return {}
@@ -269,9 +269,9 @@ def _mapping(field: str, value: object) -> dict[str, Any]:
     return value
 
 
-def _used(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What is not ignored; an empty section is one that was left out."""
-    return {key: value for key, value in values.items() if key not in IGNORED and value is not None}
+def _given(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What is given; an empty section is one that was left out."""
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def _merge(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
@@ -283,20 +283,44 @@ def _merge(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _robot(name: str, own: dict[str, Any], types: dict[str, Any], common: dict[str, Any]) -> RobotSettings:
-    match = NAME.match(name)
-    if match is None:
-        raise ConfigError("robots", name, "names such as cf3: letters, then the agent's number")
+def _merged(
+    name: str, own: dict[str, Any], types: dict[str, Any], common: dict[str, Any], unused: list[str]
+) -> dict[str, Any]:
+    """One robot's values, with those of its type and of all; keys that mean nothing here are added to `unused`."""
+    if NAME.fullmatch(name) is None:
+        raise ConfigError("robots", name, "names of letters, digits and underscores that do not begin with a digit")
     kind = own.get("type", "")
     if kind and kind not in types:
         allowed = "one of robot_types: " + (", ".join(map(str, types)) or "(there are none)")
         raise ConfigError(f"robots.{name}.type", kind, allowed)
-    merged = _used(_merge(_merge(common, _mapping(f"robot_types.{kind}", types.get(kind))), own))
-    with named(f"robots.{name}"):
-        for key in ("name", "id"):
-            if key in merged:
-                raise ConfigError(key, merged[key], "nothing: the robot's key says it")
-        return build(RobotSettings, {**merged, "name": name, "id": int(match[1])})
+    known = {spec.name for spec in settings_of(RobotSettings)} - {"name"}
+    levels = [("all", common), (f"robot_types.{kind}", _mapping(f"robot_types.{kind}", types.get(kind)))]
+    result: dict[str, Any] = {}
+    for where, values in (*levels, (f"robots.{name}", own)):
+        battery = values.get("battery")
+        if isinstance(battery, dict):
+            unused += [f"{where}.battery.{key}" for key in battery if key not in BATTERY_KEYS]
+            values = values | {"battery": {key: value for key, value in battery.items() if key in BATTERY_KEYS}}
+        unused += [f"{where}.{key}" for key in values if key not in known]
+        result = _merge(result, _given({key: value for key, value in values.items() if key in known}))
+    return result
+
+
+def _ids(robots: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
+    """Agents' ids by the robots' names: those given, else numbers of names that are 1 to N, else the file's order.
+
+    :raises ConfigError: two robots have one id.
+    """
+    numbers = {name: int(match[0]) if (match := NUMBER.search(name)) else 0 for name in robots}
+    if sorted(numbers.values()) != list(range(1, len(robots) + 1)):
+        numbers = {name: place for place, name in enumerate(robots, 1)}
+    ids: dict[str, int] = {}
+    for name, own in robots.items():
+        ids[name] = own.get("id", numbers[name])
+        for other in ids:
+            if other != name and ids[other] == ids[name]:
+                raise ConfigError(f"robots.{name}.id", ids[name], f"an id of its own ({other} has it)")
+    return ids
 
 
 def _params(groups: object) -> dict[str, float]:

@@ -9,24 +9,21 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.scenario import make_scenario
-from dtsa_agent.crazyflie.links.board_orders import BoardOrders
-from dtsa_agent.crazyflie.links.emergency_radio import EmergencyRadio
-from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO, require_cflib
-from dtsa_agent.crazyflie.safety.rules import Action, SafetyMonitor, Verdict
-from dtsa_agent.crazyflie.settings.config import SwarmSettings
-from dtsa_agent.crazyflie.settings.on_board import key_of, orders, parameters
-from dtsa_agent.crazyflie.settings.radio_budget import WATCHDOG_HZ, check_budget, radio_loads
-from dtsa_agent.crazyflie.state.conversions import VehicleState
-from dtsa_agent.crazyflie.state.state_machine import State
-from dtsa_agent.crazyflie.vehicle.reports import Snapshot, snapshot, watched
-from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
+
+from .addresses import WATCHDOG_HZ, check_budget, parse_address
+from .link import SIMULATED_RADIO, require_cflib
+from .onboard import BoardOrders, key_of, orders, parameters
+from .safety import Action, SafetyMonitor, Verdict
+from .settings import SwarmSettings
+from .state import State, VehicleState
+from .vehicle import OFF, Snapshot, Vehicle
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
@@ -48,7 +45,7 @@ class Ownership:
             directory.mkdir(mode=0o700)
         for name, uri in robots:
             air = os.environ.get(SIMULATED_RADIO, "") if uri.startswith("radio://") else ""  # one of several
-            address = air + uri.partition("?")[0].lower()
+            address = air + parse_address(uri).link
             file = os.open(directory / hashlib.sha256(address.encode()).hexdigest(), os.O_CREAT | os.O_RDWR, 0o600)
             self._files.append(file)
             try:
@@ -67,7 +64,6 @@ class Bridge:
     """The swarm. Its own thread applies the safety rules 50 times a second.
 
     :param on_state: called with a vehicle and each new state of it, in a thread of the link's.
-    :param on_event: called with a vehicle's name (empty: all), the rule and the reason when a safety rule acts.
     :raises ConfigError: cflib is missing, or the radios cannot carry the swarm.
     """
 
@@ -76,29 +72,24 @@ class Bridge:
         settings: SwarmSettings,
         log: Callable[[str, str], None],
         on_state: Callable[[Vehicle, VehicleState], None] | None = None,
-        on_event: Callable[[str, str, str], None] | None = None,
     ) -> None:
         self.settings = settings
         station = settings.station
-        loads = radio_loads(settings.radio_rates())
-        for load in loads:
-            log("info" if load.fits else "warn", str(load))
-        wired = len(settings.robots) - sum(len(load.robots) for load in loads)
-        if wired:
-            log("info", f"{wired} Crazyflies without a radio (udp, usb): no budget")
-        check_budget(loads, force=station.force_budget)
+        for line in settings.summary():
+            log("info", line)
+        check_budget(settings.loads, force=station.force_budget)
         require_cflib()
         self._ownership = Ownership((robot.name, robot.uri) for robot in settings.robots)
         self._log = log
-        self._on_event = on_event
-        cache = Path(
-            station.toc_cache or Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dtsa/crazyflie"
-        )
-        cache = cache.expanduser()
+        caches = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        cache = Path(station.toc_cache or caches / "dtsa/crazyflie").expanduser()
         cache.mkdir(parents=True, exist_ok=True)
         self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state) for r in settings.robots}
         self._prepare_boards()
-        self.emergency = EmergencyRadio([r.uri for r in settings.robots], log)
+        from .drivers import Radios  # needs cflib
+
+        self.radios = Radios(((r.name, r.address) for r in settings.robots), log)
+        self.radios.keep_spare()
         self.monitor = SafetyMonitor(station.safety)
         self._heartbeat: float | None = None
         self._closing = threading.Event()
@@ -119,7 +110,7 @@ class Bridge:
         for _ in vehicles:
             while not (waiting.acquire(timeout=0.1) or stop()):
                 pass
-        return [v.name for v in vehicles if v.state in (State.DISCONNECTED, State.CONNECTING)]
+        return [v.name for v in vehicles if v.state in OFF]
 
     def _prepare_boards(self) -> None:
         """What agents on board are told, where they steer."""
@@ -135,15 +126,14 @@ class Bridge:
         """Start the agents on board of those that are connected, all at once; why some do not start, or ""."""
         vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
         vehicles = [v for v in vehicles if v.link.connected and v.link.board is not None]
-        problems: SimpleQueue[str] = SimpleQueue()
-        for vehicle in vehicles:
-            vehicle.link.start_agent(lambda text, name=vehicle.name: problems.put(text and f"{name}: {text}"))  # type: ignore[misc]
-        return "; ".join(filter(None, (problems.get() for _ in vehicles)))
+        with ThreadPoolExecutor(max(1, len(vehicles))) as pool:
+            problems = pool.map(lambda vehicle: vehicle.link.start_agent(), vehicles)
+            return "; ".join(f"{v.name}: {text}" for v, text in zip(vehicles, problems, strict=True) if text)
 
     @property
     def connected(self) -> int:
         """Number of connected Crazyflies."""
-        return sum(v.state not in (State.DISCONNECTED, State.CONNECTING) for v in self.vehicles.values())
+        return sum(v.state not in OFF for v in self.vehicles.values())
 
     def reconnect(self, name: str) -> str:
         """Connect one again that is lost, disconnected or stopped; why not, or an empty text. Does not wait."""
@@ -151,19 +141,18 @@ class Bridge:
         with vehicle.lock:
             state, age = vehicle.state, vehicle.log_age(time.monotonic())
             if state == State.LOST and age < GROUNDED_S:
-                return (
-                    f"{name} may still be in the air: wait until it was silent for {GROUNDED_S:g} s (now {age:.1f} s)"
-                )
+                wait = f"wait until it was silent for {GROUNDED_S:g} s (now {age:.1f} s)"
+                return f"{name} may still be in the air: {wait}"
             if state not in (State.LOST, State.DISCONNECTED, State.EMERGENCY):
                 return f"{name} is {state.name.lower()}"
             vehicle.connect(partial(self._rejoin, name))
         return ""
 
     def _rejoin(self, name: str) -> None:
-        """It is connected again, or not: its agent on board starts anew, in the link's worker."""
-        vehicle = self.vehicles[name]
-        if vehicle.link.connected and vehicle.link.board is not None:
-            vehicle.link.start_agent(lambda text: self._log("error", f"{name}: {text}") if text else None)
+        """It is connected again, or not: its agent on board starts anew."""
+        link = self.vehicles[name].link
+        if link.connected and link.board is not None and (problem := link.start_agent()):
+            self._log("error", f"{name}: {problem}")
 
     # -- orders to several ------------------------------------------------------------------------------------------
     def each(self, names: Iterable[str], order: Callable[[Vehicle], str | None]) -> tuple[bool, str]:
@@ -171,23 +160,14 @@ class Bridge:
 
         With more than one name, those that are not there are skipped: one missing drone must not ground the swarm.
         """
-        names = list(names)
-        problems = []
-        done = 0
-        for name in names:
-            vehicle = self.vehicles[name]
-            if len(names) > 1 and vehicle.state in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY, State.LOST):
-                problems.append(f"{name} skipped: {vehicle.standing}")
-                continue
-            problem = order(vehicle)
-            if problem:
-                problems.append(problem)
-            else:
-                done += 1
-        refused = [p for p in problems if " skipped: " not in p]
-        if problems:
-            self._log("warn", "; ".join(problems))
-        return done > 0 and not refused, "; ".join(problems)
+        vehicles = [self.vehicles[name] for name in names]
+        absent = [v for v in vehicles if len(vehicles) > 1 and v.state in (*OFF, State.EMERGENCY, State.LOST)]
+        given = [v for v in vehicles if v not in absent]
+        refused = [problem for v in given if (problem := order(v))]
+        text = "; ".join([*(f"{v.name} skipped: {v.standing}" for v in absent), *refused])
+        if text:
+            self._log("warn", text)
+        return len(given) > 0 and not refused, text
 
     def enough(self) -> str:
         """Why the swarm may not take off; empty if it may."""
@@ -206,7 +186,7 @@ class Bridge:
     def stop_all(self, reason: str) -> None:
         """Emergency stop of all."""
         self._log("error", f"EMERGENCY STOP of all: {reason}")
-        self.emergency.stop_all()
+        self.radios.stop_all()
         for vehicle in self.vehicles.values():
             vehicle.stop(reason)
 
@@ -226,42 +206,47 @@ class Bridge:
             now = time.monotonic()
             self.slowest_tick = max(self.slowest_tick, now - last)
             last = now
-            vehicles = self.vehicles.values()
-            age = None if self._heartbeat is None else now - self._heartbeat
-            for verdict in self.monitor.check(now, [watched(v, now) for v in vehicles], age):
-                self._act(verdict, now)
-            for vehicle in vehicles:
-                vehicle.tick(now)
-            if now >= keep_alive:
-                keep_alive = now + 1.0 / WATCHDOG_HZ
-                for vehicle in vehicles:
-                    vehicle.keep_alive(now, self.settings.station.safety.emergency_watchdog)
+            feed = now >= keep_alive
+            keep_alive = now + 1.0 / WATCHDOG_HZ if feed else keep_alive
+            try:
+                self._apply_rules(now, feed)
+            except Exception as error:  # of one vehicle: the rules of the others must go on
+                self._log("error", f"safety: {type(error).__name__}: {error}")
+
+    def _apply_rules(self, now: float, feed: bool) -> None:
+        vehicles = self.vehicles.values()
+        age = None if self._heartbeat is None else now - self._heartbeat
+        for vehicle in vehicles if feed else ():
+            vehicle.keep_alive(now, self.settings.station.safety.emergency_watchdog)
+        for verdict in self.monitor.check(now, [v.watched(now) for v in vehicles], age):
+            self._act(verdict, now)
+        for vehicle in vehicles:
+            vehicle.tick(now)
 
     def _act(self, verdict: Verdict, now: float) -> None:
-        level = "warn" if verdict.action in (Action.WARN, Action.HOLD) else "error"
-        self._log(level, f"{verdict.name or 'all'}: {verdict.rule}: {verdict.reason}: {verdict.action.value}")
-        if verdict.action is Action.STOP_ALL:
-            self.stop_all(verdict.reason)
+        action, reason = verdict.action, verdict.reason
+        level = "warn" if action in (Action.WARN, Action.HOLD) else "error"
+        self._log(level, f"{verdict.name or 'all'}: {verdict.rule}: {reason}: {action.value}")
+        if action is Action.STOP_ALL:
+            self.stop_all(reason)
+            return
+        vehicle = self.vehicles[verdict.name]
+        if action is Action.WARN:
+            vehicle.action = reason
+        elif action is Action.HOLD:
+            vehicle.hold(reason, stale=True, until_seen=verdict.rule == "positions")
+        elif action is Action.LAND:
+            vehicle.land(reason)
+        elif action is Action.LOST:
+            vehicle.lose(reason, now)
         else:
-            vehicle = self.vehicles[verdict.name]
-            if verdict.action is Action.WARN:
-                vehicle.action = verdict.reason
-            elif verdict.action is Action.HOLD:
-                vehicle.hold(verdict.reason, stale=True, until_seen=verdict.rule == "positions")
-            elif verdict.action is Action.LAND:
-                vehicle.land(verdict.reason)
-            elif verdict.action is Action.LOST:
-                vehicle.lose(verdict.reason, now)
-            elif verdict.action is Action.STOP:
-                vehicle.stop(verdict.reason)
-        if self._on_event is not None:
-            self._on_event(verdict.name, verdict.rule, verdict.reason)
+            vehicle.stop(reason)
 
     # -- the end ----------------------------------------------------------------------------------------------------
     def snapshots(self) -> list[Snapshot]:
         """State of all."""
         now = time.monotonic()
-        return [snapshot(v, now) for v in self.vehicles.values()]
+        return [v.snapshot(now) for v in self.vehicles.values()]
 
     def in_air(self, now: float) -> list[str]:
         """Names of those whose link must not be closed now."""
@@ -297,15 +282,9 @@ class Bridge:
         self._guard.join(1.0)
         guarded = [v.name for v in self.vehicles.values() if v.guarded]
         if guarded:
-            self._log(
-                "info",
-                f"{', '.join(guarded)}: locked by the emergency watchdog within 1 s: restart before flying again",
-            )
-        for vehicle in self.vehicles.values():
-            vehicle.link.close()
-        deadline = time.monotonic() + 5.0
-        for vehicle in self.vehicles.values():
-            if not vehicle.link.join(max(0.0, deadline - time.monotonic())):
-                self._log("warn", f"{vehicle.name}: the link does not close")
-        self.emergency.close()
+            why = "locked by the emergency watchdog within 1 s: restart before flying again"
+            self._log("info", f"{', '.join(guarded)}: {why}")
+        with ThreadPoolExecutor(len(self.vehicles)) as pool:
+            list(pool.map(lambda vehicle: vehicle.link.close(), self.vehicles.values()))
+        self.radios.close()
         self._ownership.release()

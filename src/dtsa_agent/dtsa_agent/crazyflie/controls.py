@@ -1,7 +1,24 @@
 """What a Crazyflie's firmware is told to fly: a stream of commands, a path, a landing, or a velocity without a place.
 
-The vehicle decides what is flown; here is how it is told so that the motors keep turning. The vehicle's lock protects
-all of it. Times (`now`, `until`) are s, monotonic.
+A set-point's way from the graph to the motors, and who may stop it:
+
+1. **Topic.** `commands` reads each vehicle's `cmd_*` topics in a thread of its own, turns a message into a
+   :class:`~dtsa_agent.crazyflie.commands.Setpoint`, dated by its publication, and refuses one that is too fast or leads
+   out of the fence.
+2. **Whether it counts now** is decided here, in :meth:`Controls.command`. It does not count unless the vehicle is
+   armed or flies, after a safety rule has taken the controls (`overruled`, until the next take-off), while motion
+   capture does not see the vehicle (`paused`), or while a take-off or go-to is flown to its end (`guard_until`). One
+   that counts ends whatever else was flown: a braking, an order that is being repeated.
+3. **The link** (`link`) gives it to cflib, whose driver (`drivers`) keeps the newest one until it can be sent.
+4. **When the stream stops.** `safety` looks at the command's age 50 times a second: :meth:`Vehicle.hold` comes first,
+   then :meth:`Vehicle.land`. Both brake by a stream of zero velocity, then give an order to the firmware's high-level
+   commander. The order goes out before the end of the stream, or the motors would stop for a moment.
+
+The firmware's high-level commander flies polynomials of degree 7 from rest to rest, whatever the duration. If it is too
+short, the vehicle lags behind its path, and a landing stops the motors at the end of the path, wherever the vehicle is.
+So durations that no vehicle can keep are refused, and a landing takes longer.
+
+The vehicle's lock protects all of it. Times (`now`, `until`) are s, monotonic.
 """
 
 from __future__ import annotations
@@ -12,12 +29,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from dtsa_agent.crazyflie.links.link import Link
-from dtsa_agent.crazyflie.settings.config import StationSettings
-from dtsa_agent.crazyflie.state.conversions import Setpoint, Vector, velocity_world
+from .commands import Setpoint, velocity_world
+from .link import Link, Send
+from .settings import StationSettings
+from .state import State, StateMachine, Vector
 
-from .limits import landing_s
-
+PEAK = 35 / 16  # largest over mean speed of such a polynomial, at its middle
+SHORTEST_S = 0.1  # of any path, however short
+MIN_LAND_S = 1.0
 # A landing is planned as if from rest, and a path to a place swings out by metres if it begins at high speed: before a
 # landing and before holding a place the vehicle is first braked by streamed setpoints of zero velocity.
 SLOW_MPS = 0.25
@@ -36,8 +55,29 @@ REPEAT_S = 0.15
 BUSY = 4  # a take-off is ordered so often while the supervisor lets no motor run: 3 s after a landing it goes through a
 # state in which none may, also where the vehicle arms itself again at once
 ENDS = 2  # the end of a stream of setpoints is not answered: it is sent this often again
+ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
 
-Send = Callable[[Any], None]
+
+def shortest_s(distance: float, limit: float) -> float:
+    """Shortest duration (s) of a path (m) from rest to rest with a largest speed of `limit` (m/s)."""
+    return max(SHORTEST_S, PEAK * abs(distance) / limit)
+
+
+def too_short(duration: float, distance: float, limit: float) -> str:
+    """Why a duration (s) is too short for a distance (m) at a largest speed of `limit` (m/s); empty if it is not."""
+    needed = shortest_s(distance, limit)
+    if duration >= needed:
+        return ""
+    return (
+        f"duration {duration:.2f} s is too short for {abs(distance):.2f} m: "
+        f"at least {needed:.2f} s (station.max_speed_mps is {limit:g})"
+    )
+
+
+def landing_s(distance: float, wanted: float, station: StationSettings) -> float:
+    """Duration (s) of a landing over a distance (m): as wanted (0: at the station's speed), or longer if too short."""
+    seconds = wanted if wanted > 0.0 else max(MIN_LAND_S, abs(distance) / station.land_speed_mps)
+    return max(seconds, shortest_s(distance, station.max_speed_mps))
 
 
 def end_of_stream(cf: Any) -> None:
@@ -107,8 +147,14 @@ class Delivery:
 class Controls:
     """The present stream, path, braking or landing of one Crazyflie."""
 
-    def __init__(self, link: Link, station: StationSettings) -> None:
-        self._link, self._station = link, station
+    def __init__(
+        self, link: Link, station: StationSettings, machine: StateMachine, lock: Any, log: Callable[[str], None]
+    ) -> None:
+        self._link, self._station, self._machine, self._lock, self._log = link, station, machine, lock, log
+        self.moved = False  # something that makes it fly was sent since it was armed
+        self.overruled = False  # a rule took the controls: streamed commands do not count until the next take-off
+        self.paused = False  # held because it is not seen: streamed commands do not count until it is
+        self.refused = 0  # streamed commands that did not count
         self.delivery = Delivery()
         self.streaming = False  # the firmware follows streamed commands, not the high-level commander
         self.held = False  # the stream of commands broke off and the place is being held
@@ -118,9 +164,14 @@ class Controls:
         self._blind: tuple[Vector, float] | None = None  # velocity that needs no place, and until when (s)
         self._landings: list[float] = []  # s: when to repeat a landing that may not have been heard
 
+    @property
+    def standing(self) -> str:
+        """The vehicle's state, and why it is in it."""
+        return f"{self._machine.state.name.lower()}: {self._machine.reason}"
+
     def reset(self) -> None:
         """A new connection."""
-        self.streaming = self.held = False
+        self.overruled = self.paused = self.streaming = self.held = False
         self._command_time = -math.inf
         self._blind = None
         self._landings.clear()
@@ -142,12 +193,21 @@ class Controls:
         return now - self._command_time
 
     # -- streams and paths ------------------------------------------------------------------------------------------
-    def stream(self, setpoint: Setpoint) -> None:
-        """A streamed command: it is in charge now."""
-        self._command_time = setpoint.stamp
-        self.delivery.cancel()
-        self.streaming, self.held, self._brake = True, False, None
-        self._link.outbox.put_setpoint(setpoint)
+    def command(self, setpoint: Setpoint) -> bool:
+        """Stream a command; False when it is not for the present state."""
+        with self._lock:
+            early = setpoint.stamp < self.guard_until
+            if self._machine.state not in ACCEPTS_COMMANDS or self.overruled or self.paused or early:
+                self.refused += 1
+                return False
+            if self.held:
+                self._log("commands again")
+            self._command_time = setpoint.stamp
+            self.delivery.cancel()
+            self.moved = self.streaming = True
+            self.held, self._brake = False, None
+            self._link.stream(setpoint)
+            return True
 
     def fly(self, kind: str, action: Send, duration: float, now: float, *, again: bool = True) -> None:
         """An order to the high-level commander, and only then the end of the stream of setpoints.
@@ -188,7 +248,7 @@ class Controls:
             action()
         else:
             self.streaming = True
-            self._link.outbox.put_setpoint(velocity_world(STANDSTILL, 0.0, now))
+            self._link.stream(velocity_world(STANDSTILL, 0.0, now))
 
     def land(self, height: float, way: float, duration: float, now: float) -> None:
         """Sink straight down to a height (m above the floor), over a way (m), and stop the motors."""
@@ -237,7 +297,7 @@ class Controls:
         self._brake, self._blind = None, (velocity, until)
         self.held, self.streaming = False, True
         self.delivery.cancel()
-        self._link.outbox.put_setpoint(velocity_world(velocity, 0.0, now))
+        self._link.stream(velocity_world(velocity, 0.0, now))
 
     def go_on_blindly(self, in_air: bool, seen: Vector | None, now: float) -> None:
         """The next packet of a stream that needs no place; the motors stop once the vehicle must be down.
@@ -253,4 +313,4 @@ class Controls:
             self._blind, self.streaming = None, False
             self._link.order(end_of_stream)  # with nothing to fly the end of the stream stops the motors
         else:
-            self._link.outbox.put_setpoint(velocity_world(velocity, 0.0, now))
+            self._link.stream(velocity_world(velocity, 0.0, now))

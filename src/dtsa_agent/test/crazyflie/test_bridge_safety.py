@@ -1,28 +1,36 @@
-"""State machine, outbox, safety rules and limits of the bridge: without ROS and without links."""
+"""State machine, mailbox, safety rules and limits of the bridge: without ROS and without links."""
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import math
 import re
+import time
 from contextlib import nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.crazyflie.links.outbox import Outbox
-from dtsa_agent.crazyflie.motion.controls import LAND, TAKEOFF, Delivery
-from dtsa_agent.crazyflie.motion.limits import check_stream, outside_fence
-from dtsa_agent.crazyflie.safety.rules import ESTIMATE_HOLD_S, Action, SafetyMonitor, SafetySettings, Watched
-from dtsa_agent.crazyflie.settings.config import StationSettings
-from dtsa_agent.crazyflie.state import conversions
-from dtsa_agent.crazyflie.state import state_machine as sm
-from dtsa_agent.crazyflie.state.conversions import Setpoint
-from dtsa_agent.crazyflie.state.state_machine import State, StateMachine
+from dtsa_agent.crazyflie import commands
+from dtsa_agent.crazyflie import state as sm
+from dtsa_agent.crazyflie.commands import check_stream
+from dtsa_agent.crazyflie.controls import LAND, TAKEOFF, Delivery
+from dtsa_agent.crazyflie.safety import (
+    ESTIMATE_HOLD_S,
+    Action,
+    SafetyMonitor,
+    SafetySettings,
+    Watched,
+    outside_fence,
+)
+from dtsa_agent.crazyflie.settings import StationSettings
+from dtsa_agent.crazyflie.state import State, StateMachine
+
+if TYPE_CHECKING:
+    from dtsa_agent.crazyflie.drivers import Mailbox
 
 
 def machine(*bits: int) -> StateMachine:
@@ -105,28 +113,47 @@ def test_any_sequence_of_events_keeps_to_the_table(events: list[Any]) -> None:
             assert m.state in (State.EMERGENCY, State.LOST)
 
 
-def test_only_the_latest_command_is_sent_and_orders_go_first() -> None:
-    box = Outbox()
-    order = lambda: None  # noqa: E731
-    box.put_setpoint(Setpoint("position", (1,), 0.0))
-    box.put_setpoint(Setpoint("position", (2,), 0.0))
-    assert box.get().arguments == (2,)  # type: ignore[union-attr]
+SETPOINT, POSITION = b"\x7c\x08", b"\x6c\x01"
+GO_TO, LAND_ORDER, NOTIFY, WATCHDOG, STOP = b"\x8c\x0c1", b"\x8c\x08", b"\x7d\x00", b"\x9d\x04", b"\x9d\x03"
+PARAMETER, LOG = b"\x2e\x01", b"\x5d\x05"
+
+
+def taken(box: Mailbox) -> list[bytes]:
+    return [found[1] for found in iter(box.take, None)]
+
+
+def mailbox(*packets: bytes) -> Mailbox:
+    pytest.importorskip("cflib")
+    from dtsa_agent.crazyflie.drivers import Mailbox
+
+    box = Mailbox()
+    for packet in packets:
+        box.put(packet)
+    return box
+
+
+def test_only_the_latest_command_is_sent_orders_go_first_and_the_others_take_turns() -> None:
+    box = mailbox(PARAMETER, SETPOINT + b"1", POSITION, SETPOINT + b"2", WATCHDOG, LOG)
+    assert taken(box) == [WATCHDOG, SETPOINT + b"2", PARAMETER, POSITION, LOG]
     assert box.replaced == 1
-    box.put_background(order)
-    box.put_setpoint(Setpoint("position", (3,), 0.0))
-    assert box.get() is order
-    assert box.get().arguments == (3,)  # type: ignore[union-attr]
+    assert taken(mailbox(SETPOINT, WATCHDOG, WATCHDOG)) == [WATCHDOG, SETPOINT]
 
 
-def test_an_order_ends_the_stream_and_an_urgent_one_empties_the_box() -> None:
-    box = Outbox()
-    urgent = lambda: None  # noqa: E731
-    box.put_setpoint(Setpoint("position", (1,), 0.0))
-    box.put_order(lambda: None)
-    box.put_order(urgent, urgent=True)
-    box.close()
-    assert box.get() is urgent
-    assert box.get() is None
+def test_an_order_ends_the_stream_and_an_emergency_stop_empties_the_box() -> None:
+    assert taken(mailbox(SETPOINT, GO_TO, NOTIFY, GO_TO)) == [GO_TO, NOTIFY, GO_TO]
+    assert taken(mailbox(SETPOINT, GO_TO, PARAMETER, STOP, STOP, STOP)) == [STOP, STOP, STOP]
+
+
+def test_an_order_that_has_waited_for_long_takes_nobody_by_surprise(monkeypatch: pytest.MonkeyPatch) -> None:
+    box = mailbox(GO_TO, STOP)
+    box.put(LAND_ORDER)
+    old = mailbox(SETPOINT, POSITION, PARAMETER)
+    later = time.monotonic() + 1.1
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    assert taken(box) == [STOP]
+    assert taken(old) == [PARAMETER]
+    flood = mailbox(*(GO_TO + bytes((k,)) for k in range(200)))
+    assert 0 < len(taken(flood)) < 50
 
 
 def vehicle(name: str = "cf1", **changes: Any) -> Watched:
@@ -234,33 +261,34 @@ def test_a_rule_speaks_again_after_it_had_ceased() -> None:
 
 
 def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused() -> None:
-    station = StationSettings()
-    assert outside_fence((1.5, 0.0, 1.0), station) == ""
-    assert outside_fence((1.95, 0.0, 0.95), station) == "(1.95, 0.00, 0.00) is 0.45 m outside the geofence in x"
-    assert outside_fence((0.0, 0.0, 2.5), station).endswith("0.60 m outside the geofence in z")
+    station, origin = StationSettings(), (0.0, 0.0, 0.95)
+    fence = station.safety
+    limits = fence, origin, station.max_stream_mps
+    assert outside_fence((1.5, 0.0, 1.0), fence, origin) == ""
+    assert outside_fence((1.95, 0.0, 0.95), fence, origin) == "(1.95, 0.00, 0.00) is 0.45 m outside the geofence in x"
+    assert outside_fence((0.0, 0.0, 2.5), fence, origin).endswith("0.60 m outside the geofence in z")
     for axis in range(3):
         for speed, allowed in ((station.max_stream_mps, True), (station.max_stream_mps + 0.01, False)):
             velocity = tuple(speed if k == axis else 0.0 for k in range(3))
-            command = conversions.velocity_world(velocity, 0.0, 0.0)  # type: ignore[arg-type]
+            command = commands.velocity_world(velocity, 0.0, 0.0)  # type: ignore[arg-type]
             with nullcontext() if allowed else pytest.raises(ValueError, match="m/s is refused"):
-                check_stream(command, station)
-    open_air = dataclasses.replace(station, safety=SafetySettings(geofence=False))
-    assert outside_fence((9.0, 0.0, 1.0), open_air) == ""
+                check_stream(command, *limits)
+    assert outside_fence((9.0, 0.0, 1.0), SafetySettings(geofence=False), origin) == ""
     still = (0.0, 0.0, 0.0)
     for setpoint in (
-        conversions.velocity_world((1.5, 0.0, 0.0), 0.0, 0.0),
-        conversions.position((1.0, 2.0, 1.0), 0.0, 0.0),
-        conversions.full_state((1.0, 0.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0),
+        commands.velocity_world((1.5, 0.0, 0.0), 0.0, 0.0),
+        commands.position((1.0, 2.0, 1.0), 0.0, 0.0),
+        commands.full_state((1.0, 0.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0),
     ):
-        check_stream(setpoint, station)
+        check_stream(setpoint, *limits)
     for setpoint, words in (
-        (conversions.velocity_world((50.0, 0.0, 0.0), 0.0, 0.0), "50.00 m/s is refused (station.max_stream_mps is 3)"),
-        (conversions.position((1.95, 0.0, 1.0), 0.0, 0.0), "0.45 m outside the geofence in x"),
-        (conversions.full_state((0.0, 3.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "geofence in y"),
-        (conversions.full_state((0.0, 0.0, 1.0), (0.0, 9.0, 0.0), still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "9.00 m/s"),
+        (commands.velocity_world((50.0, 0.0, 0.0), 0.0, 0.0), "50.00 m/s is refused (station.max_stream_mps is 3)"),
+        (commands.position((1.95, 0.0, 1.0), 0.0, 0.0), "0.45 m outside the geofence in x"),
+        (commands.full_state((0.0, 3.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "geofence in y"),
+        (commands.full_state((0.0, 0.0, 1.0), (0.0, 9.0, 0.0), still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "9.00 m/s"),
     ):
         with pytest.raises(ValueError, match=re.escape(words)):
-            check_stream(setpoint, station)
+            check_stream(setpoint, *limits)
 
 
 def test_a_take_off_is_ordered_again_while_the_supervisor_lets_no_motor_run() -> None:

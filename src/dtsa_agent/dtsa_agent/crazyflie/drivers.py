@@ -1,0 +1,545 @@
+"""Crazyradios and UDP ports as links of cflib, by its public interface: drivers that the bridge brings along.
+
+cflib's own driver over the air repeats one packet until it is acknowledged while all others wait behind it, closes the
+link after 100 missing acknowledgements, and its thread dies with the dongle. cflib's driver over UDP takes the error of
+a closed port for the end of the link. So here are drivers (`cflib.crtp.crtpdriver.CRTPDriver`) of our own:
+
+- One thread a dongle serves its Crazyflies in turn, through `cflib.drivers.crazyradio.Crazyradio`.
+- A mailbox a Crazyflie has all commands in sequence, the newest set-point, the newest position, and requests that want
+  an answer (parameters, logs). Sending never waits. Commands come first; the others take turns.
+- With safelink a bit tells a new packet from a repetition. A packet is repeated until it is acknowledged, set-points
+  and positions only for a short while and as long as there is no newer one. While nothing is acknowledged, perhaps
+  because only the acknowledgements are missing, commands are sent with either bit, one after the other: one counts.
+- A link never ends by itself. A dongle that is pulled is named; once it is there again its links go on.
+
+Set-points of port 3, of which `close_link` sends one, never leave.
+
+Upstream: crazyflie-lib-python, issue 63 (links that close after missing acknowledgements), and crazyflie-link-cpp,
+issue 24 (set-points that are repeated although newer ones wait).
+Delete when: cflib's drivers keep the newest set-point only, outlive a silence and a dongle that is pulled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+import cflib.crtp
+from cflib.crtp.crtpdriver import CRTPDriver
+from cflib.crtp.crtpstack import CRTPPacket
+from cflib.crtp.exceptions import WrongUriType
+from cflib.drivers.crazyradio import Crazyradio, get_serials
+
+from .addresses import ANY, BITRATES, Address, parse_address
+
+Report = Callable[[str, str], None]  # level and line
+COMMAND, SETPOINT, POSITION, REQUEST, EMPTY = "command", "setpoint", "position", "request", "empty"
+TURNS = (SETPOINT, REQUEST, POSITION)
+NULL = b"\xff"
+SAFELINK, SAFELINK_TRIES = b"\xff\x05\x01", 10  # asks for the bits, and is answered by itself
+HEADER, UP_BIT, DOWN_BIT = 0xF3, 0x08, 0x04
+# By the supervisor's port, and by the localization's, where firmware before protocol version 12 has them.
+EMERGENCY, WATCHDOG = (b"\x91\x03", b"\x61\x03"), (b"\x91\x04", b"\x61\x04")
+END_OF_STREAM, HIGH_LEVEL, LEGACY_SETPOINT = 0x71, 0x80, 0x30
+COMMAND_LIFE_S, MOST_COMMANDS = 1.0, 20  # one that waited longer would take somebody by surprise
+DEAF_S = 0.25  # nothing acknowledged for that long, though the dongle asks all the time
+RELAXED_S, BUSY_POLLS = 0.01, 10  # pause between polls once so many in a row were answered with nothing
+ABSENT_S, ABSENT_POLL_S = 1.0, 0.02  # pause between polls of one that has not answered for that long
+REOPEN_S = 0.3  # between attempts to find a dongle that has gone
+LATE_ANSWERS = 3  # a dongle that does not answer so often has gone
+CLOSE_S = 0.3  # longest wait at the end for commands that have not been sent
+BROADCAST = (0xFF, 0xE7, 0xE7, 0xE7, 0xE7)  # every Crazyflie listens to it, and acknowledges nothing
+ROUNDS, PAUSE_S = 25, 0.02  # of an emergency stop by broadcast, and the time between two
+FOREIGN_SHARE, FOREIGN_PACKETS = 0.25, 200  # so many packets repeated, of the last so many: somebody else sends
+
+
+def kind_of(packet: bytes) -> str:
+    """Return how a packet to a Crazyflie is treated."""
+    header, first = packet[0] & HEADER, packet[1] if len(packet) > 1 else -1
+    if header == 0x70:
+        return SETPOINT
+    if header == 0x60 or (header == 0x61 and first == 8):
+        return POSITION
+    return COMMAND if header in (END_OF_STREAM, HIGH_LEVEL, 0x91, 0x61, 0xD0) else REQUEST
+
+
+class Mailbox:
+    """What one Crazyflie is to be sent. For any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._commands: deque[tuple[bytes, float]] = deque(maxlen=MOST_COMMANDS)
+        self._requests: deque[bytes] = deque()
+        self._newest: dict[str, tuple[bytes, float]] = {}
+        self._turn = 0
+        self.replaced = 0  # set-points that a newer one overtook
+
+    def put(self, packet: bytes) -> None:
+        """Add a packet; an order ends the stream of set-points, an emergency stop empties the box."""
+        kind, start = kind_of(packet), bytes((packet[0] & HEADER, *packet[1:2]))
+        with self._lock:
+            if kind == REQUEST:
+                self._requests.append(packet)
+            elif kind != COMMAND:
+                self.replaced += kind == SETPOINT and kind in self._newest
+                self._newest[kind] = packet, time.monotonic()
+            elif start not in WATCHDOG or all(packet != waiting for waiting, _ in self._commands):
+                if start in EMERGENCY:
+                    self._requests.clear()
+                    self._commands = deque((c for c in self._commands if c[0] == packet), MOST_COMMANDS)
+                if start in EMERGENCY or start[0] in (END_OF_STREAM, HIGH_LEVEL):
+                    self._newest.pop(SETPOINT, None)
+                self._commands.append((packet, time.monotonic()))
+
+    def take(self, kind: str = "") -> tuple[str, bytes] | None:
+        """Return the next packet, of one kind or of any, and its kind; None: there is none."""
+        with self._lock:
+            now = time.monotonic()
+            self._newest = {kind: both for kind, both in self._newest.items() if now - both[1] < DEAF_S}
+            while self._commands and kind in ("", COMMAND):
+                packet, since = self._commands.popleft()
+                if now - since < COMMAND_LIFE_S or packet[1:2] == b"\x03":
+                    return COMMAND, packet
+            for number in range(self._turn, self._turn + len(TURNS)):
+                turn = TURNS[number % len(TURNS)]
+                waits = self._requests if turn == REQUEST else turn in self._newest
+                if waits and kind in ("", turn):
+                    self._turn = (number + 1) % len(TURNS)
+                    return turn, self._requests.popleft() if turn == REQUEST else self._newest.pop(turn)[0]
+        return None
+
+    def put_back(self, request: bytes) -> None:
+        """Return a request that may not have arrived."""
+        with self._lock:
+            self._requests.appendleft(request)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing waits."""
+        return not (self._commands or self._requests or self._newest)
+
+    @property
+    def has_commands(self) -> bool:
+        """Whether commands wait."""
+        return bool(self._commands)
+
+
+class _Driver(CRTPDriver):  # type: ignore[misc]
+    """What both kinds of link have in common."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mailbox = Mailbox()
+        self.sent = 0  # packets but for polls
+        self.quality: float | None = None  # 0..1; None: the link does not say
+        self.rssi = 0  # -dBm; 0: the link does not say
+        self.acknowledged = float("-inf")  # s, monotonic: when anything last came, or was acknowledged
+        self.on_heard: Callable[[], None] = lambda: None  # the end of a silence
+        self.on_setpoint: Callable[[], None] = lambda: None  # a set-point has been sent
+
+    def limit(self, polls_hz: float) -> None:
+        """From now on send at most so many packets a second."""
+
+    def _heard(self, now: float) -> None:
+        silent, self.acknowledged = now - self.acknowledged > DEAF_S, now
+        if silent:
+            self.on_heard()
+
+
+class RadioDriver(_Driver):
+    """One Crazyflie's link over a dongle. `due`, `exchange` and what they call belong to the dongle's thread."""
+
+    def __init__(self, radios: Radios) -> None:
+        super().__init__()
+        self._radios = radios
+        self._arrived: queue.Queue[Any] = queue.Queue()
+        self._dongle: Dongle | None = None
+        self._pending: tuple[str, bytes] | None = None  # sent, and not acknowledged
+        self._tries, self._safelink, self._up, self._down = 0, False, 0, 0
+        self._last = self._least_s = 0.0  # s: when a packet last went (monotonic), and shortest time between two
+        self._empty_polls, self._established = 0, False
+        self._scores: deque[int] = deque(maxlen=100)  # 10 less the repetitions of each packet
+
+    def connect(self, uri: str, statistics: Any, error: Callable[[str], None] | None) -> None:
+        """Open the link; raises an error while there is no such dongle."""
+        if not uri.startswith("radio://"):
+            raise WrongUriType("not a radio")
+        self.address = parse_address(uri)
+        self.node = tuple(bytes.fromhex(self.address.node))
+        self.rate = tuple(BITRATES).index(self.address.rate)
+        limit = uri.partition("rate_limit=")[2].partition("&")[0]
+        if limit.isdigit() and int(limit):
+            self.limit(float(limit))
+        dongle = self._radios.dongle(self.address)
+        dongle.add(self)
+        self._dongle = dongle
+
+    def limit(self, polls_hz: float) -> None:
+        self._least_s = 1.0 / polls_hz
+
+    def send_packet(self, pk: Any) -> bool:
+        if pk.header & 0xF0 != LEGACY_SETPOINT and self._dongle is not None:
+            self.mailbox.put(bytes((pk.header,)) + bytes(pk.data))
+            self._dongle.wake()
+        return True
+
+    def receive_packet(self, wait: float = 0) -> Any:
+        with contextlib.suppress(queue.Empty):
+            return self._arrived.get(wait != 0, None if wait < 0 else wait)
+        return None
+
+    def close(self) -> None:
+        dongle, self._dongle = self._dongle, None
+        if dongle is not None:
+            dongle.remove(self)
+        self._arrived.put(None)  # wakes whoever waits for a packet
+
+    def due(self, now: float) -> float:
+        """Return when the next packet goes (s, monotonic)."""
+        pause = self._least_s
+        if now - self.acknowledged > ABSENT_S and self._tries >= SAFELINK_TRIES and not self.mailbox.has_commands:
+            pause = max(pause, ABSENT_POLL_S)
+        elif self._pending is None and self.mailbox.empty and self._empty_polls > BUSY_POLLS:
+            pause = max(pause, RELAXED_S)
+        return self._last + pause
+
+    def exchange(self, radio: Any) -> bool | None:
+        """Send the next packet and take the answer.
+
+        :returns: whether it had to be repeated; None: the dongle has not answered.
+        """
+        now = self._last = time.monotonic()
+        radio.set_channel(self.address.channel)
+        radio.set_address(self.node)
+        radio.set_data_rate(self.rate)
+        greeting = not self._safelink and self._tries < SAFELINK_TRIES
+        packet, both = (SAFELINK, False) if greeting else self._choose(now)
+        self._tries += greeting
+        answer = None
+        for up in (1 - self._up, self._up) if both else (self._up,):
+            bits = bytes((packet[0] & HEADER | up * UP_BIT | self._down * DOWN_BIT,)) if self._safelink else packet[:1]
+            answer = radio.send_packet(bits + packet[1:])
+            if answer is not None and answer.ack:
+                self._answered(bytes(answer.data), answer.retry, greeting)
+                return bool(answer.retry)
+        return None if answer is None else False
+
+    def _choose(self, now: float) -> tuple[bytes, bool]:
+        """Return the packet to send, and whether with either bit."""
+        box, pending, both = self.mailbox, self._pending, False
+        if pending is None:
+            pending = box.take() or (EMPTY, NULL)
+        elif now - self.acknowledged > DEAF_S:
+            if (command := box.take(COMMAND)) is not None:
+                if pending[0] == REQUEST:
+                    box.put_back(pending[1])
+                pending, both = command, True
+            elif pending[0] in (SETPOINT, POSITION):
+                pending = EMPTY, NULL  # too old
+        elif pending[0] in (SETPOINT, POSITION):
+            pending = box.take(pending[0]) or pending
+        self._pending = pending
+        return pending[1], both
+
+    def _answered(self, data: bytes, repeated: int, greeting: bool) -> None:
+        self._scores.append(10 - repeated)
+        self.quality = sum(self._scores) / len(self._scores) / 10
+        kind, fresh = EMPTY, bool(data)
+        if greeting:
+            self._safelink, fresh = data == SAFELINK, False
+            self.needs_resending = not self._safelink
+        else:
+            kind, self._pending = self._pending[0] if self._pending else EMPTY, None
+            if self._safelink:
+                fresh = fresh and data[0] & DOWN_BIT == self._down * DOWN_BIT
+                self._up, self._down = 1 - self._up, 1 - self._down if fresh else self._down
+        self.sent += kind != EMPTY
+        if kind == SETPOINT:
+            self.on_setpoint()
+        self._heard(time.monotonic())
+        if not fresh:
+            return
+        nothing = data[0] & HEADER == HEADER
+        self._empty_polls = self._empty_polls + (kind == EMPTY) if nothing else 0
+        if nothing and data[1:2] == b"\x01" and len(data) > 2:
+            self.rssi = data[2]
+        if not nothing or not self._established:  # cflib wants one packet, whatever it is, to begin
+            self._established = True
+            self._arrived.put(CRTPPacket(data[0], list(data[1:])))
+
+
+class Dongle(threading.Thread):
+    """A Crazyradio, and the thread that serves its Crazyflies in turn.
+
+    :param radio: number or serial.
+    :param names: of Crazyflies, by their links.
+    """
+
+    def __init__(self, radio: str, report: Report, names: dict[str, str]) -> None:
+        super().__init__(name=f"radio {radio}", daemon=True)
+        self.radio, self._report, self._names = radio, report, names
+        self.foreign = False  # somebody else sends on the channel, as it seems
+        self._condition = threading.Condition()
+        self._links: list[RadioDriver] = []
+        self._stops: deque[tuple[int, int]] = deque()  # channel and data rate of packets that stop all
+        self._closing = False
+        self._late = 0
+        self._repeated: deque[bool] = deque()
+        self._serial = ""
+        self._device: Any = self._open()
+        self.start()
+
+    def _open(self) -> Any:
+        serials = get_serials()
+        if not self._serial:
+            number = int(self.radio) if len(self.radio) < 10 else len(serials)
+            self._serial = serials[number] if number < len(serials) else self.radio
+        if self._serial not in serials:
+            raise OSError(f"radio {self.radio} is not there")
+        if serials.count(self._serial) > 1:  # old firmware: all have one serial number
+            return Crazyradio(devid=int(self.radio))
+        return Crazyradio(serial=self._serial)
+
+    def add(self, link: RadioDriver) -> None:
+        """Serve a link; raises an error while the dongle is not there."""
+        if self._device is None:
+            raise OSError(f"radio {self.radio} is not there")
+        with self._condition:
+            self._links.append(link)
+            self._condition.notify()
+
+    def remove(self, link: RadioDriver) -> None:
+        """Serve a link no more, once its commands are sent or have waited for long enough."""
+        end = time.monotonic() + CLOSE_S
+        while self._device is not None and link.mailbox.has_commands and time.monotonic() < end:
+            time.sleep(0.005)
+        with self._condition:
+            self._links.remove(link)
+            self._condition.notify()
+
+    def wake(self) -> None:
+        """Tell the thread that there is something to send."""
+        with self._condition:
+            self._condition.notify()
+
+    def stop_channel(self, channel: int, rate: int) -> None:
+        """Stop all Crazyflies on a channel; does not wait."""
+        self._stops.append((channel, rate))
+        self.wake()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._closing = True
+        self.wake()
+        self.join(2.0)
+
+    def run(self) -> None:
+        """Serve until it is closed."""
+        turn = 0
+        while not self._closing or self._stops:
+            if self._device is None and not self._find():
+                time.sleep(REOPEN_S)
+                continue
+            with self._condition:
+                now, links = time.monotonic(), self._links[turn:] + self._links[:turn]
+                due = [link.due(now) for link in links]
+                ready = next((link for link, when in zip(links, due, strict=True) if when <= now), None)
+                if ready is None and not self._stops and not self._closing:
+                    self._condition.wait(max(0.0, min(due) - now) if due else None)
+                    continue
+                turn = (self._links.index(ready) + 1) % len(self._links) if ready is not None else 0
+            try:
+                if self._stops:
+                    self._send_stops(*self._stops.popleft())
+                if ready is not None:
+                    self._serve(ready)
+            except Exception as error:  # USB's errors have no common base
+                self._lose(str(error))
+        with contextlib.suppress(Exception):
+            self._device.close()
+
+    def _serve(self, link: RadioDriver) -> None:
+        repeated = link.exchange(self._device)
+        self._late = self._late + 1 if repeated is None else 0
+        if self._late and (self._late >= LATE_ANSWERS or self._serial not in get_serials()):
+            raise OSError("no answer on USB")
+        self._repeated.append(bool(repeated))
+        if len(self._repeated) == FOREIGN_PACKETS:
+            share, before = sum(self._repeated) / FOREIGN_PACKETS, self.foreign
+            self._repeated.clear()
+            self.foreign = share > FOREIGN_SHARE
+            if self.foreign and not before:
+                text = f"{share:.0%} of the packets on channel {link.address.channel} are repeated"
+                self._report("warn", f"radio {self.radio}: {text}: does somebody else send there?")
+
+    def _send_stops(self, channel: int, rate: int) -> None:
+        self._device.set_channel(channel)
+        self._device.set_data_rate(rate)
+        self._device.set_address(BROADCAST)
+        self._device.set_ack_enable(False)
+        for packet in EMERGENCY:
+            self._device.handle.write(endpoint=1, data=bytes((packet[0] | 0x0C, packet[1])), timeout=100)
+        self._device.set_ack_enable(True)
+
+    def _lose(self, why: str) -> None:
+        served = ", ".join(self._names.get(link.address.link, link.address.uri) for link in self._links)
+        self._report("error", f"radio {self.radio} ({self._serial}) is gone ({why}): {served or 'nobody'} out of reach")
+        device, self._device = self._device, None
+        with contextlib.suppress(Exception):
+            device.close()
+
+    def _find(self) -> bool:
+        with contextlib.suppress(Exception):  # not there yet
+            self._device = self._open()
+            self._late = 0
+            self._report("info", f"radio {self.radio} ({self._serial}) is there again")
+        return self._device is not None or self._closing
+
+
+class UdpDriver(_Driver):
+    """A link over UDP, for simulated Crazyflies. It ends by errors only before something was heard over it."""
+
+    _socket: socket.socket | None = None
+    _error: Callable[[str], None] | None = None
+
+    def connect(self, uri: str, statistics: Any, error: Callable[[str], None] | None) -> None:
+        """Open the link."""
+        if not uri.startswith("udp://"):
+            raise WrongUriType("not UDP")
+        address = parse_address(uri)
+        self.needs_resending, self._error = False, error
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect((address.host, address.port))
+
+    def send_packet(self, pk: Any) -> bool:
+        sock, data = self._socket, bytes((pk.header,)) + bytes(pk.data)
+        if sock is None or data[0] & 0xF0 == LEGACY_SETPOINT:
+            return True
+        try:
+            try:
+                sock.send(data)
+            except ConnectionRefusedError:  # the answer to an earlier packet; this one was not sent
+                sock.send(data)
+        except OSError as problem:
+            self._fail(str(problem))
+            return True
+        self.sent += 1
+        if kind_of(data) == SETPOINT:
+            self.on_setpoint()
+        return True
+
+    def receive_packet(self, wait: float = 0) -> Any:
+        if (sock := self._socket) is None:
+            return None
+        try:
+            sock.settimeout(None if wait < 0 else wait)
+            data = sock.recv(64)
+        except (TimeoutError, BlockingIOError):
+            return None
+        except OSError as problem:  # a closed port: it may be opened again
+            self._fail(str(problem))
+            time.sleep(0.005)
+            return None
+        if not data:
+            return None
+        self._heard(time.monotonic())
+        return CRTPPacket(data[0], list(data[1:]))
+
+    def _fail(self, problem: str) -> None:
+        error, self._error = self._error, None
+        if error is not None and self._socket is not None and self.acknowledged == float("-inf"):
+            error(problem)
+
+    def close(self) -> None:
+        sock, self._socket = self._socket, None
+        if sock is not None:
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)  # wakes whoever waits for a packet
+            sock.close()
+
+
+class Radios:
+    """The dongles of one bridge; cflib opens links by the drivers above until it is closed.
+
+    :param robots: names and addresses.
+    :param report: called with a level and a line about dongles that come and go.
+    """
+
+    def __init__(self, robots: Iterable[tuple[str, Address]], report: Report) -> None:
+        robots = list(robots)
+        self._names = {address.link: name for name, address in robots}
+        self._addresses = [address for _, address in robots if address.radio]
+        self._report = report
+        self._dongles: dict[str, Dongle] = {}
+        self._lock = threading.Lock()
+        self._drivers: list[Any] = [partial(RadioDriver, self), UdpDriver]
+        self.spare: Dongle | None = None  # that no link uses: emergency stops go by it
+        cflib.crtp.CLASSES[:0] = self._drivers
+
+    def dongle(self, address: Address) -> Dongle:
+        """Return the dongle of an address; raises an error if it is not there."""
+        radio = self._radio(address)
+        with self._lock:
+            if radio not in self._dongles:
+                self._dongles[radio] = Dongle(radio, self._report, self._names)
+            return self._dongles[radio]
+
+    def _radio(self, address: Address) -> str:
+        """Return the dongle of an address; of links that name none: one a channel, as far as there are dongles."""
+        if address.radio != ANY:
+            return address.radio
+        named = {a.channel: a.radio for a in reversed(self._addresses) if a.radio != ANY}
+        channels = sorted({a.channel for a in self._addresses} - named.keys())
+        free = [str(n) for n in range(len(get_serials())) if str(n) not in named.values()] or ["0"]
+        return named.get(address.channel) or free[channels.index(address.channel) % len(free)]
+
+    def keep_spare(self) -> None:
+        """Keep the first dongle that no link uses for emergency stops."""
+        if not self._addresses:
+            return
+        used = {self._radio(address) for address in self._addresses}
+        for number, serial in enumerate(get_serials()):
+            if used & {str(number), serial}:
+                continue
+            try:
+                self.spare = Dongle(str(number), self._report, self._names)
+            except Exception as error:  # in use by another program, or no right to use it
+                self._report("warn", f"radio {number} cannot be used for emergency stops: {error}")
+                continue
+            self._report("info", f"radio {number} is kept for emergency stops")
+            return
+        self._report("warn", "no radio is left for emergency stops: they go by the radios of the links")
+
+    @property
+    def foreign(self) -> list[str]:
+        """Dongles on whose channels somebody else seems to send."""
+        return [name for name, dongle in sorted(self._dongles.items()) if dongle.foreign]
+
+    def stop_all(self) -> None:
+        """Stop all Crazyflies on the swarm's channels, by broadcast, again and again; does not wait."""
+        jobs = []
+        for address in {(a.radio, a.channel, a.rate): a for a in self._addresses}.values():
+            with contextlib.suppress(Exception):  # a dongle that is not there must not keep the others from it
+                dongle = self.spare or self.dongle(address)
+                jobs.append(partial(dongle.stop_channel, address.channel, tuple(BITRATES).index(address.rate)))
+
+        def send() -> None:
+            for _ in range(ROUNDS if jobs else 0):
+                for job in jobs:
+                    job()
+                time.sleep(PAUSE_S)
+
+        threading.Thread(target=send, name="emergency-stop", daemon=True).start()
+
+    def close(self) -> None:
+        """Close all dongles, and leave cflib as it was."""
+        cflib.crtp.CLASSES[:] = [driver for driver in cflib.crtp.CLASSES if driver not in self._drivers]
+        for dongle in (*self._dongles.values(), *([self.spare] if self.spare else [])):
+            dongle.close()

@@ -1,0 +1,439 @@
+"""The link to one Crazyflie over cflib: how it is opened, what goes out, and the log that comes in.
+
+Whatever goes out is one call of cflib's public interface; the drivers (`drivers`) take each packet at once, so any
+thread may send. cflib's threads deliver what comes in.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib.util
+import logging
+import math
+import os
+import threading
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import ConfigError
+
+from .addresses import LinkError
+from .commands import Setpoint
+from .onboard import BoardOrders
+from .positions import Settling
+from .settings import RobotSettings
+from .state import LOG_VARIABLES, Vector, VehicleState, decode_log
+
+SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Crazyradios, for simulation only
+FIRST_ANSWER_S = 2.0  # over the air nothing else tells that nobody is there
+HEARD_S = 0.25  # something came or was acknowledged within that time: it can be heard
+NOBODY_S = 10.0  # simulated Crazyflies that are started at the same time take so long to listen
+PAUSE_S = (0.1, 0.5)  # first and longest pause before a closed port is asked again
+LOG_ORDER_S = 0.4  # nothing logged for that long, though it can be heard: the log is ordered anew
+REFUSED = f"[Errno {errno.ECONNREFUSED}]"  # in the words of a driver: nobody listens there
+VARIANCES = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
+PLACE = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")
+INITIAL = ("kalman.initialX", "kalman.initialY", "kalman.initialZ")
+VARIANCE_MS = 50
+RESET_S = 0.1  # the firmware's tasks have seen the parameter by then
+
+Send = Callable[[Any], None]  # gives an order to cflib's `Crazyflie`
+
+
+def require_cflib() -> None:
+    """Load cflib's drivers, once.
+
+    :raises ConfigError: cflib is not installed; the text says how to get it.
+    """
+    if importlib.util.find_spec("cflib") is None:
+        allowed = "an installed cflib: tools/dtsa setup --extra cflib, or pip install cflib==0.1.34"
+        raise ConfigError("cflib", "not installed", allowed)
+    with warnings.catch_warnings():  # cflib shows all DeprecationWarnings, those of other packages too
+        import cflib.crtp
+
+    if path := os.environ.get(SIMULATED_RADIO):
+        from dtsa_agent.air.crazyradio.simulated import replace_real_dongles
+
+        replace_real_dongles(Path(path))
+    if not cflib.crtp.CLASSES:
+        cflib.crtp.init_drivers(enable_serial_driver=True)
+    # Its own warnings are about what the bridge reports by itself, in terms of the swarm.
+    for name in ("cflib", "cflib.crazyflie", "cflib.crtp"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", message="The supervisor subsystem requires CRTP", category=UserWarning)
+
+
+class LogClock:
+    """How old the values of a log packet are.
+
+    After a gap the Crazyflie delivers what it logged meanwhile: packets that come are not always new. Their time stamps
+    tell, as the smallest delay that was ever seen is that of a packet without a wait. Times (`now`) are s, monotonic.
+    """
+
+    DRIFT = 1e-4  # of the Crazyflie's clock against ours, at most
+    RESTARTED_S = 5.0  # a stamp that is so far off is that of a Crazyflie that was switched on again
+
+    def __init__(self) -> None:
+        self.last = -math.inf  # s, monotonic, when a log packet came
+        self._offset: float | None = None
+
+    def sampled(self, stamp_ms: int, now: float) -> float:
+        """Return when the values of a packet that has come now were taken; its time stamp is the Crazyflie's."""
+        offset = now - stamp_ms / 1000
+        if self._offset is None or abs(offset - self._offset) > self.RESTARTED_S:
+            self._offset = offset
+        else:
+            self._offset = min(offset, self._offset + self.DRIFT * (now - self.last))
+        self.last = now
+        return min(now, stamp_ms / 1000 + self._offset)
+
+
+class Opening:
+    """How far a connection has come, as cflib's threads say."""
+
+    def __init__(self) -> None:
+        self.settled = threading.Event()  # it is connected, or that has failed
+        self.failure = ""  # why it has failed; empty: it has not
+
+    def fail(self, reason: str) -> None:
+        """It has failed."""
+        self.failure = self.failure or reason
+        self.settled.set()
+
+
+class Link:
+    """One Crazyflie's connection and log.
+
+    :param cache: folder for the tables of variables.
+    :param on_state: called with each decoded log packet and when it was logged (s, monotonic), in a thread of cflib's.
+    :param on_broken: called with a reason when the connection ends by itself, in a thread of cflib's.
+    :param on_answer: called with the first byte of a high-level order and the firmware's answer, in such a thread.
+    :param seen: where motion capture sees the Crazyflie (m, world); None: not at all.
+    """
+
+    def __init__(
+        self,
+        robot: RobotSettings,
+        cache: Path,
+        on_state: Callable[[VehicleState, float], None],
+        on_broken: Callable[[str], None],
+        on_answer: Callable[[int, int], None],
+        settling: Settling,
+        seen: Callable[[], Vector | None],
+    ) -> None:
+        self.robot = robot
+        self.connected = False
+        self.received = 0  # log packets
+        self.firmware: tuple[int, str] | None = None  # version of its protocol, and revision; None: never connected
+        self.board: BoardOrders | None = None  # what the app on board is told; None: there is none
+        self.guarded = False  # the firmware's emergency watchdog wants to be fed as soon as it can be
+        self.latencies: deque[float] = deque(maxlen=500)  # s, from the arrival of a command to its packet
+        self.send_times: deque[float] = deque(maxlen=200)  # s, monotonic, of the last streamed commands
+        self._cache, self._settling, self._seen = cache, settling, seen
+        self._on_state, self._on_broken, self._on_answer = on_state, on_broken, on_answer
+        self._closed = False
+        self._cf: Any = None
+        self._driver: Any = None  # ours; None: one of cflib's own
+        self._opening = Opening()
+        self._stamp = 0.0  # s, monotonic, of the last streamed command
+        self._log_clock = LogClock()
+        self._last_packet = self._heard_since = self._log_ordered = -math.inf  # s, monotonic
+        self._log_order_s = LOG_ORDER_S
+        self._log_block: Any = None
+        self._sent_before = 0  # packets of connections that have ended
+
+    # -- what goes out ----------------------------------------------------------------------------------------------
+    @property
+    def crazyflie(self) -> Any:
+        """The connected `Crazyflie` of cflib; None: there is none."""
+        return self._cf if self.connected else None
+
+    def stream(self, setpoint: Setpoint) -> None:
+        """Send a set-point; a newer one replaces it as long as it waits."""
+        if (cf := self.crazyflie) is not None:
+            self._stamp = setpoint.stamp
+            getattr(cf.commander, f"send_{setpoint.kind}_setpoint")(*setpoint.arguments)
+            if self._driver is None:
+                self._streamed()
+
+    def _streamed(self) -> None:
+        """A set-point has been sent."""
+        now = time.monotonic()
+        self.latencies.append(now - self._stamp)
+        self.send_times.append(now)
+
+    def order(self, action: Send) -> None:
+        """Give an order, if there is a connection. Emergency stops go before everything that waits."""
+        if (cf := self.crazyflie) is not None:
+            self._give(cf, action)
+
+    @property
+    def can_set(self) -> bool:
+        """Whether parameters can be set now: it is connected, and their values are known."""
+        cf = self.crazyflie
+        return cf is not None and bool(cf.param.is_updated)
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set a parameter that exists to a value that it can have; does not wait."""
+        if self.can_set:  # else cflib would keep this thread waiting
+            with contextlib.suppress(KeyError, AttributeError):  # the link has just ended
+                self._cf.param.set_value(name, value)
+
+    def send_position(self, send: Send) -> None:
+        """Send where motion capture sees it, while it connects, too: the estimator settles by that."""
+        if (cf := self._cf) is not None and cf.is_connected():
+            self._give(cf, send)
+
+    def _give(self, cf: Any, action: Send) -> None:
+        try:
+            action(cf)
+        except Exception as error:  # cflib's, of a link that has just ended
+            self._on_broken(f"could not send: {error}")
+
+    # -- what is known of it ----------------------------------------------------------------------------------------
+    @property
+    def sent(self) -> int:
+        """Packets to it."""
+        return self._sent_before + (0 if self._driver is None else self._driver.sent)
+
+    @property
+    def replaced(self) -> int:
+        """Set-points that a newer one overtook."""
+        return 0 if self._driver is None else self._driver.mailbox.replaced
+
+    @property
+    def quality(self) -> float | None:
+        """Quality of the radio, 0..1; None: there is no radio."""
+        return None if self._driver is None else self._driver.quality
+
+    @property
+    def rssi(self) -> int:
+        """Strength of the signal, -dBm; 0: there is no radio."""
+        return 0 if self._driver is None else self._driver.rssi
+
+    def silence(self, now: float) -> float:
+        """Seconds since something was acknowledged, or came; infinite before that."""
+        return now - (self._last_packet if self._driver is None else self._driver.acknowledged)
+
+    # -- connection -------------------------------------------------------------------------------------------------
+    def connect(self) -> str:
+        """Connect, in the calling thread; why it failed, or an empty text."""
+        attempts, attempt, reason = self.robot.connect_attempts, 1, "the link has been closed"
+        pause, longest = PAUSE_S
+        patience = time.monotonic() + min(NOBODY_S, self.robot.connect_timeout_s)
+        while attempt <= attempts and not self._closed:
+            try:
+                self._connect()
+                return ""
+            except LinkError as error:  # noqa: PERF203
+                reason = f"attempt {attempt} of {attempts}: {error}"
+                self._drop()
+                # A closed port says so at once: that is no attempt as long as it may be about to be opened.
+                nobody = REFUSED in reason and time.monotonic() < patience
+                attempt += not nobody
+                if nobody:
+                    time.sleep(pause)
+                    pause = min(2 * pause, longest)
+        return reason
+
+    def _connect(self) -> None:
+        """Connect once.
+
+        :raises LinkError: it did not work.
+        """
+        from cflib.crazyflie import Crazyflie
+
+        self._drop()
+        limit = self.robot.connect_timeout_s
+        deadline = time.monotonic() + limit
+        cf = Crazyflie(rw_cache=str(self._cache))
+        opening = self._watch(cf)
+        self._cf = cf
+        cf.open_link(self.robot.uri)
+        self._watch_driver(cf.link)
+        settled = opening.settled.wait(min(FIRST_ANSWER_S, limit))
+        if self.robot.address.radio and not settled and self.silence(time.monotonic()) == math.inf:
+            raise LinkError(f"no answer on the air within {FIRST_ANSWER_S:g} s")
+        if not opening.settled.wait(max(0.0, deadline - time.monotonic())):
+            raise LinkError(f"no answer within {limit:g} s")
+        if opening.failure:
+            raise LinkError(opening.failure)
+        if self.robot.address.radio:
+            cf.link_statistics.stop()  # its pings take air; elsewhere they tell that the Crazyflie is there
+        for name, value in self.robot.firmware_params.items():
+            try:
+                cf.param.set_value(name, value)
+            except (KeyError, AttributeError) as error:  # noqa: PERF203
+                raise LinkError(f"firmware parameter {name}: {error}") from error
+        if self.board is not None:
+            self.board.prepare(cf)
+        if self.robot.reset_estimator:
+            self._reset_estimator(cf)
+        self.firmware = _firmware(cf)
+        self._start_log(cf, max(deadline, time.monotonic() + 2.0))
+        self.connected = True
+
+    def _watch(self, cf: Any) -> Opening:
+        """Take note of all that cflib says about a connection, from its threads."""
+        from cflib.crtp.crtpstack import CRTPPort
+
+        opening = self._opening = Opening()
+
+        def broken(uri: str, message: str) -> None:
+            reason = message.partition("\n\n")[0].replace("\n", " ")
+            opening.fail(reason)
+            if self._cf is cf and self.connected:
+                self.connected = False
+                self._on_broken(f"link broken: {reason}")
+
+        def received(packet: Any) -> None:
+            self._last_packet = time.monotonic()
+
+        def answered(packet: Any) -> None:
+            if len(packet.data) > 3:
+                self._on_answer(packet.data[0], packet.data[3])
+
+        cf.fully_connected.add_callback(lambda uri: opening.settled.set())
+        cf.connection_failed.add_callback(broken)
+        cf.connection_lost.add_callback(broken)
+        cf.packet_received.add_callback(received)
+        cf.add_port_callback(CRTPPort.SETPOINT_HL, answered)
+        return opening
+
+    def _watch_driver(self, driver: Any) -> None:
+        if hasattr(driver, "mailbox"):
+            self._driver = driver
+            driver.on_heard, driver.on_setpoint = self._heard, self._streamed
+
+    def _heard(self) -> None:
+        """The end of a silence: the firmware's watchdog has not much time left."""
+        self._heard_since = time.monotonic()
+        if self.guarded:
+            self.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
+
+    def _reset_estimator(self, cf: Any) -> None:
+        """Restart the Kalman filter, and wait until it knows where it stands; positions are sent meanwhile.
+
+        :raises LinkError: it does not settle in time, and why.
+        """
+        from cflib.crazyflie.log import LogConfig
+
+        settled, timeout = threading.Event(), self.robot.estimator_timeout_s
+
+        def sample(stamp: int, values: dict[str, float], block: Any) -> None:
+            x, y, z = (values[name] for name in PLACE)
+            vx, vy, vz = (values[name] for name in VARIANCES)
+            if self._settling.sample((x, y, z), (vx, vy, vz), self._seen()):
+                settled.set()
+
+        if (place := self._seen()) is not None:  # the filter begins where it is seen, not metres away
+            for name, value in zip(INITIAL, place, strict=True):
+                cf.param.set_value(name, value)
+        cf.param.set_value("kalman.resetEstimation", 1)
+        time.sleep(RESET_S)
+        cf.param.set_value("kalman.resetEstimation", 0)
+        self._settling.restart()
+        block = LogConfig("variance", VARIANCE_MS)
+        for name in (*VARIANCES, *PLACE):
+            block.add_variable(name, "float")
+        block.data_received_cb.add_callback(sample)
+        try:
+            cf.log.add_config(block)
+        except KeyError:
+            return  # another estimator than the Kalman filter: nothing to wait for
+        block.start()
+        settled.wait(timeout)
+        block.delete()
+        if not settled.is_set():
+            raise LinkError(f"the estimator did not settle within {timeout:g} s: {self._settling.problem}")
+
+    def start_agent(self) -> str:
+        """Start the agent on board, in the calling thread; why it does not start, or an empty text.
+
+        From then on the bridge asks seldom: its packets take air from the agents.
+        """
+        cf, board = self.crazyflie, self.board
+        if cf is None or board is None:
+            return "not connected"
+        try:
+            board.start(cf)
+        except LinkError as error:
+            return str(error)
+        if self._driver is not None:
+            self._driver.limit(board.polls_hz)
+            # An order takes some packets of each way, and the log comes seldom.
+            self._log_order_s = LOG_ORDER_S + 1.0 / self.robot.log_rate_hz + 5.0 / board.polls_hz
+        return ""
+
+    # -- log --------------------------------------------------------------------------------------------------------
+    def _start_log(self, cf: Any, deadline: float) -> None:
+        first = threading.Event()
+        self._begin_log(cf, first.set)
+        if not first.wait(max(0.0, deadline - time.monotonic())):
+            raise LinkError("no log packets")
+
+    def _begin_log(self, cf: Any, received: Callable[[], None]) -> None:
+        """Order the log; `received` is called with each packet."""
+        from cflib.crazyflie.log import LogConfig
+
+        block = LogConfig("state", max(10, round(1000 / self.robot.log_rate_hz / 10) * 10))
+        for name in LOG_VARIABLES:
+            block.add_variable(name)
+
+        def receive(stamp: int, values: dict[str, float], config: Any) -> None:
+            self.received += 1
+            self._on_state(decode_log(values), self._log_clock.sampled(stamp, time.monotonic()))
+            received()
+
+        block.data_received_cb.add_callback(receive)
+        try:
+            cf.log.add_config(block)
+        except KeyError as error:
+            raise LinkError(f"the firmware does not log {error}: update it") from error
+        block.start()
+        self._log_block = block
+
+    def order_log(self, now: float) -> None:
+        """Order the log anew, if it can be heard now (s, monotonic): the firmware ends it in a gap of a second."""
+        last = max(self._log_clock.last, self._heard_since, self._log_ordered)
+        if self.silence(now) > HEARD_S or now - last < self._log_order_s:
+            return
+        self._log_ordered = now
+
+        def order(cf: Any) -> None:
+            self._log_block.delete()
+            with contextlib.suppress(ValueError):
+                cf.log.log_blocks.remove(self._log_block)
+            self._begin_log(cf, lambda: None)
+
+        self.order(order)
+
+    # -- end --------------------------------------------------------------------------------------------------------
+    def _drop(self) -> None:
+        self.connected = False
+        cf, self._cf = self._cf, None
+        if cf is not None:
+            with contextlib.suppress(Exception):  # whatever state it is in, we are done with it
+                cf.close_link()
+        self._sent_before, self._driver = self.sent, None
+
+    def close(self) -> None:
+        """Close the connection. Never in flight."""
+        self._closed = True
+        self._opening.fail("the link has been closed")
+        self._drop()
+
+
+def _firmware(cf: Any) -> tuple[int, str]:
+    """Version of the protocol and revision of the firmware."""
+    try:
+        revision = f"{int(cf.param.get_value('firmware.revision0')):08x}"
+        modified = int(cf.param.get_value("firmware.modified"))
+    except (KeyError, AttributeError, TypeError, ValueError):
+        return int(cf.platform.get_protocol_version()), "unknown"
+    return int(cf.platform.get_protocol_version()), revision + (" modified" if modified else "")

@@ -1,1 +1,0 @@
-"""The safety rules, and where those that land come down. Pure."""

@@ -1,1 +1,0 @@
-"""One Crazyflie as the bridge knows it: its link, its state, its orders, its way down."""
