@@ -147,7 +147,7 @@ MUTANTS = (
         "lease.adoption && !v.a->probation && ", "lease.adoption && ", _ADOPTS,
     ),
     Mutant(
-        "what others relay changes no entry", "lease.c", "} else if (sender == *there) {", "} else if (1) {", _RELAYS,
+        "what others relay changes no entry", "lease.c", "} else if (sender == *known) {", "} else if (1) {", _RELAYS,
     ),
     Mutant(
         "no turn is handed on to its owner", "issue.c",
@@ -158,8 +158,7 @@ MUTANTS = (
         "agent->table->config->lease.adoption && !v.a->probation", "!v.a->probation", World("dies", 2),
     ),
     Mutant(
-        "an agent that has handed a turn on never takes it for its own again", "lease.c",
-        "(given || handed)", "(given && !handed)", _HANDS,
+        "an owner does not change what its lessee has handed on", "lease.c", "!from_me && issuer", "issuer", _RELAYS,
     ),
 )  # fmt: skip
 

@@ -28,8 +28,8 @@ _OF_AGENTS = (
     "chosen", "reason", "score", "digest", "sends", "present", "position", "velocity", "command", "track",
 )  # fmt: skip
 _OF_TABLES = (
-    "sent_position", "sent_velocity", "sent_intent", "sent_slot", "last_turn", "in_ap", "entry_hash", "table_hash",
-    "priority", "counter",
+    "sent_position", "sent_velocity", "sent_intent", "innovation", "sent_slot", "last_turn", "in_ap", "entry_hash",
+    "table_hash", "priority", "counter",
 )  # fmt: skip
 _ESTIMATES = ("estimate_position", "estimate_velocity")
 

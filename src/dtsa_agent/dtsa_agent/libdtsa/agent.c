@@ -83,6 +83,7 @@ static dtsa_agent *lay_out(arena *m, const dtsa_config *c)
     t.sent_p = part(m, 3 * n, sizeof(double));
     t.sent_v = part(m, 3 * n, sizeof(double));
     t.sent_c = part(m, 3 * n, sizeof(double));
+    t.innovation = part(m, n, sizeof(double));
     t.sent_slot = part(m, n, sizeof(int64_t));
     t.last = part(m, n, sizeof(int64_t));
     t.entry_hash = part(m, n, sizeof(uint32_t));

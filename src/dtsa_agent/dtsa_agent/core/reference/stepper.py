@@ -158,6 +158,7 @@ class ReferenceSwarm(Swarm):
         table = self.agents[place].table
         for name in ("position", "velocity", "intent"):
             getattr(self, f"sent_{name}")[place] = np.array([getattr(row, name) for row in table.rows]).T
+        self.innovation[place] = [row.innovation for row in table.rows]
         self.sent_slot[place] = [row.sent_slot for row in table.rows]
         self.last_turn[place] = [row.last_turn for row in table.rows]
         self.in_ap[place] = [row.in_ap for row in table.rows]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from dtsa_agent.core.frame import Frame
 
-from .arithmetic import ZERO, Vector, bits_of, mix64
+from .arithmetic import ZERO, Vector, bits_of, minus, mix64, norm1
 
 
 @dataclass(slots=True)
@@ -17,6 +17,7 @@ class Row:
     position: Vector  # m, frame map
     velocity: Vector = ZERO  # m/s
     intent: Vector = ZERO  # m/s, commanded velocity, zero where frames do not carry it
+    innovation: float = 0.0  # m/s, change of velocity in that state against the one before: sum over the axes
     sent_slot: int = -1  # m in eq:estimate: slot of that state, -1: never heard
     last_turn: int = -1  # slot of its last turn
     in_ap: bool = True  # it is a member of A_p: it has something to say
@@ -55,7 +56,8 @@ class Table:
         """
         row, rests = self.rows[frame.sender - 1], frame.c_r == 0
         row.position = self.known_goals[frame.sender - 1] if rests and self.known_goals is not None else frame.position
-        row.velocity = ZERO if rests else frame.velocity
+        velocity = ZERO if rests else frame.velocity
+        row.innovation, row.velocity = norm1(minus(velocity, row.velocity)), velocity
         row.intent = ZERO if rests or frame.intent is None else frame.intent
         row.sent_slot = sampled
         row.in_ap = not rests

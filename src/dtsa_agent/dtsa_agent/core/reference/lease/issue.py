@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from dtsa_agent.core.reference.arithmetic import minus, norm
+from dtsa_agent.core.reference.arithmetic import Vector, minus, norm, norm1
 from dtsa_agent.core.reference.frame_extended import FAR_REACH, LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH, SECTION_BYTES
 from dtsa_agent.core.reference.table import Table
 
@@ -15,9 +15,9 @@ FEW = 0.5  # more missed frames than this in 8 N slots: movers keep their turns
 MORE = 2  # a mover hands on turns that are worth so many times as much to somebody else
 MANY = 0.1  # share of frames
 MUCH_MORE = 3  # ... where many are lost, so that some of those named do not learn of it
-KEPT_EVERY = 2  # who may get another goal keeps its turn of every so many rounds
 ROUNDS_TOLD = 3  # who has arrived says so for so many rounds, where frames are lost
 OFTEN = 2.0  # at least so many OPEN turns for each that wakes
+NEED, MOST_NEED = 50.0, 6000.0  # NEED: s/m
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +44,7 @@ class Electorate:
     informed: bool  # all have spoken, or all know where all want to be
     lends: bool  # movers give turns away, too: most rest, all of them settled, and no frames are lost
     last: list[int]  # slot in which each sent last, or is foreseen to send
+    need: list[int]  # weight of each: more the more its velocity has just changed
     rights: list[list[int]] = field(default_factory=list)  # slots to come in which each is known to send
 
     @property
@@ -52,16 +53,20 @@ class Electorate:
         return sum(self.able)
 
 
-def say(memory: Memory, self_index: int, table: Table, slot: int, final: bool, leaves: bool) -> Said:
-    """What the agent's frame says about turns; the turns that it gives away are noted."""
+def say(memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leaves: bool) -> Said:
+    """What the agent's frame says about turns; the turns that it gives away are noted.
+
+    :param velocity: of the agent, m/s.
+    """
     own_turn = memory.owner(slot) == self_index
+    memory.spoke = slot
     leaving = memory.leaving = own_turn and leaves
     claims = memory.rules.adoption and not memory.probation and not leaving
     c_s = count_absent_before(memory, self_index, slot) if claims else 0
     leases = b""
     if own_turn:
-        leases = issue(memory, self_index, table, slot, c_s, 0 if leaving else None, final)
-    handed = hand_on(memory, self_index, table, slot, final, leases)
+        leases = issue(memory, self_index, table, slot, velocity, c_s, 0 if leaving else None, final)
+    handed = hand_on(memory, self_index, table, slot, velocity, final, leases)
     near = [turn for turn in handed if turn - slot <= RELAY_REACH]
     far = tuple(turn - slot for turn in handed if turn - slot > RELAY_REACH)
     lessee = memory.leases[handed[-1]].lessee if far else 0
@@ -76,7 +81,7 @@ def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
     return count
 
 
-def electorate(memory: Memory, self_index: int, table: Table, slot: int, final: bool) -> Electorate:
+def electorate(memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool) -> Electorate:
     """Who may be given a turn, and who else there is."""
     rows, agents = table.rows, range(memory.rules.agents)
     presumed = [is_presumed(memory, table, k, slot) for k in agents]
@@ -94,7 +99,20 @@ def electorate(memory: Memory, self_index: int, table: Table, slot: int, final: 
     lends = slot >= memory.rules.agents and few_move and memory.lost < FEW
     last = [row.sent_slot if row.sent_slot >= 0 else slot - memory.rules.agents for row in rows]
     block = open_block(memory.rules.agents, memory.rules.open_every, memory.wakers, sum(rests), sum(settled))
-    return Electorate(sum(alive), able, rests, settled, block, informed, lends, last)
+    innovation = [row.innovation for row in rows]
+    innovation[self_index] = norm1(minus(velocity, rows[self_index].velocity))  # of the frame that is being made
+    return Electorate(
+        sum(alive), able, rests, settled, block, informed, lends, last, [need_of(change) for change in innovation]
+    )
+
+
+def need_of(innovation: float) -> int:
+    """How much the wait of an agent counts: 1, and 1 more for each 2 cm/s by which its velocity has just changed.
+
+    It has just turned, and others extrapolate a velocity that it may not keep.
+    """
+    more = NEED * innovation
+    return 1 + int(more if more < MOST_NEED else MOST_NEED)
 
 
 def is_presumed(memory: Memory, table: Table, k: int, slot: int) -> bool:
@@ -163,16 +181,10 @@ def is_open(memory: Memory, who: Electorate, turn: int) -> bool:
     return not any(is_spare(memory, who, t) for t in range(first, turn))
 
 
-def is_kept(memory: Memory, turn: int) -> bool:
-    """Whether a turn stays with an owner that rests and may get another goal: it must be heard soon when it wakes."""
-    n = memory.rules.agents
-    return (turn // n + turn % n) % KEPT_EVERY == 0 or memory.is_anchor(turn)
-
-
 def is_spare(memory: Memory, who: Electorate, turn: int) -> bool:
     """Whether a turn is one that its owner gives away, as far as is known."""
     owner = memory.owner(turn)
-    kept = memory.is_main(turn) if who.settled[owner] else is_kept(memory, turn)
+    kept = memory.is_main(turn) if who.settled[owner] else memory.is_anchor(turn)
     return who.rests[owner] and turn >= memory.rules.agents and not kept
 
 
@@ -183,7 +195,14 @@ def is_lent(memory: Memory, who: Electorate, turn: int) -> bool:
 
 
 def issue(
-    memory: Memory, self_index: int, table: Table, slot: int, c_s: int, own_depth: int | None, final: bool
+    memory: Memory,
+    self_index: int,
+    table: Table,
+    slot: int,
+    velocity: Vector,
+    c_s: int,
+    own_depth: int | None,
+    final: bool,
 ) -> bytes:
     """The lease bytes of a frame in an own turn: what was given away before is said again, what is new is noted.
 
@@ -191,7 +210,7 @@ def issue(
     :param own_depth: how many own turns at most; None: as :func:`depth` says.
     :returns: a byte a turn, up to the last that is given away.
     """
-    who = electorate(memory, self_index, table, slot, final)
+    who = electorate(memory, self_index, table, slot, velocity, final)
     idle = memory.idle_since >= 0
     foreseen = slot + 1  # up to here, excluded
     rounds_mine = depth(memory, who, slot, final) if own_depth is None else own_depth
@@ -203,8 +222,7 @@ def issue(
         if mine and not (final and idle) and memory.is_anchor(turn):
             rounds_mine = 0
         reach = rounds_mine if mine else rounds_adopted
-        kept = mine and idle and not final and is_kept(memory, turn)
-        if turn not in memory.leases and not kept and rounds_ahead <= reach and not memory.probation:
+        if turn not in memory.leases and rounds_ahead <= reach and not memory.probation:
             lessee = 0
             if idle and mine and is_open(memory, who, turn):
                 lessee = OPEN
@@ -258,7 +276,7 @@ def keeps(memory: Memory, who: Electorate, turn: int) -> bool:
 
 
 def worth(memory: Memory, who: Electorate, k: int, turn: int) -> int:
-    """What a turn is worth to an agent: p min(n, m).
+    """What a turn is worth to an agent: p min(n, m), times its need.
 
     p and n are the distances from the turn to the agent's previous and next slot, as far as they are known or foreseen;
     p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off, because more leases will come
@@ -269,7 +287,7 @@ def worth(memory: Memory, who: Electorate, k: int, turn: int) -> int:
         most = (3 * who.members + 3) // 4
     before = min(turn - who.last[k], longest)
     after = next((right - turn for right in who.rights[k] if right > turn), longest)
-    return before * min(after, most)
+    return before * min(after, most) * who.need[k]
 
 
 def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> int:
@@ -281,7 +299,9 @@ def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> 
     return max(able, key=lambda k: worth(memory, who, k, turn), default=-1)  # the first of several
 
 
-def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: bool, leases: bytes) -> list[int]:
+def hand_on(
+    memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leases: bytes
+) -> list[int]:
     """Hands on turns that the agent was given; not the next slot's: frames may arrive late.
 
     If it rests, all within reach that come before its last turn there, in which it can hand on further ones; beyond the
@@ -300,7 +320,7 @@ def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: boo
     given = [t for t in (mine[:-1] if idle else mine) if t in memory.leases]
     if not given:
         return handed
-    who = electorate(memory, self_index, table, slot, final)
+    who = electorate(memory, self_index, table, slot, velocity, final)
     who.rights = look_ahead(memory, who, slot)
     who.last[self_index] = slot
     factor = MORE if memory.lost < MANY * ROUNDS * memory.rules.agents else MUCH_MORE

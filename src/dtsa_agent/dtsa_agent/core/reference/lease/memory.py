@@ -12,7 +12,7 @@ MISSED = 4  # who missed so many expected turns gets no leases
 ROUNDS = 8  # in which missed frames are counted
 GONE = -(2**61)  # in ``heard``: said that it leaves
 HANDED = 255  # in place of an issuer: the agent itself was given the turn, and has handed it on
-NEVER = -1  # in ``heard``, ``woke``, ``idle_since``
+NEVER = -1  # in ``heard``, ``woke``, ``idle_since``, ``spoke``
 
 
 @dataclass(slots=True)
@@ -52,6 +52,7 @@ class Memory:
     probation: bool = False
     anchored: bool = False  # an own anchor is over since probation began
     claimed: int = 0  # slot in which probation began or was last confirmed
+    spoke: int = NEVER  # slot of its last frame
     leaving: bool = False  # said in this slot that it leaves
 
     def patience(self, k: int) -> int:
@@ -105,27 +106,30 @@ class Memory:
             return -1
         return owner
 
-    def note(self, self_index: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
+    def note(self, self_index: int, slot: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
         """Takes note of what a frame says of a turn.
 
-        Who has been given a turn may hand it on, in a frame of its own; what is relayed later changes nothing. What the
-        agent itself has given away or handed on never is its own again. Of two that gave the turn away, which adoption
-        alone can cause, the smaller lessee stays, so that all who know both agree.
+        The lessee may hand the turn on, in a frame of its own; what is relayed later changes nothing. So a turn can
+        come back to the agent itself, but not by an older frame than its own last one, which may not know what that
+        said of the turn. Of two that gave the turn away, which adoption alone can cause, the smaller lessee stays, so
+        that all who know both agree.
 
+        :param slot: of the frame.
         :param issuer: id of who gave it away, 0: the sender relays it.
         """
         if not self.now < turn < self.now + self.window or self.is_main(turn):
             return
-        there = self.leases.get(turn)
-        if there is None:
+        known, mine = self.leases.get(turn), lessee == self_index + 1
+        if known is None:
             self.leases[turn] = Lease(lessee, issuer)
-        elif there.issuer in (self_index + 1, HANDED) and (sender != there.lessee or lessee == self_index + 1):
-            return
-        elif lessee == there.lessee:
-            there.issuer = there.issuer or issuer
-        elif sender == there.lessee:
-            there.lessee = lessee
-        elif issuer and there.issuer and issuer != there.issuer and lessee < there.lessee:
+        elif lessee == known.lessee:
+            known.issuer = known.issuer or issuer
+        elif sender == known.lessee:
+            if not mine:
+                known.lessee = lessee
+            elif slot > self.spoke:
+                self.leases[turn] = Lease(lessee, 0)
+        elif known.issuer not in (0, issuer, self_index + 1, HANDED) and issuer and lessee < known.lessee:
             self.leases[turn] = Lease(lessee, issuer)
 
     def turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:

@@ -6,9 +6,9 @@
 #include "lease.h"
 
 static const double OFTEN = 2.0, FEW = 0.5, MANY = 0.1; /* MANY: share of frames */
+static const double NEED = 50.0, MOST_NEED = 6000.0;    /* NEED: s/m */
 
 enum {
-    KEPT_EVERY = 2,  /* who may get another goal keeps its turn of every so many rounds */
     ROUNDS_TOLD = 3, /* who has arrived says so for so many rounds, where frames are lost */
     MORE = 2, /* a mover hands on turns that are worth so many times as much to somebody else */
     MUCH_MORE =
@@ -25,6 +25,7 @@ typedef struct {
     int64_t *last; /* (n) last slot in which each sent, or is foreseen to send */
     int64_t *next; /* (n) next slot in which each is known to send */
     uint16_t *again; /* (w) slots from each turn to the next one of the same agent */
+    int32_t *need;   /* (n) weight of each: more the more its velocity has just changed */
     uint8_t *able;   /* (n) may be given a turn */
     uint8_t *rests;  /* (n) gives its turns away, as far as is known */
     uint8_t *sure;   /* (n) rests and is settled: gives anchors away, but for main ones */
@@ -66,15 +67,28 @@ static int sets_out(const dtsa_config *c, int k)
     return sqrt(e2) > c->r_min;
 }
 
+/* How much the wait of an agent counts: 1, and 1 more for each 2 cm/s by which its velocity has
+ * changed in its last frame. It has just turned, and others extrapolate a velocity that it may not
+ * keep. */
+static int32_t need(double innovation)
+{
+    const double more = NEED * innovation;
+    return 1 + (int32_t)(more < MOST_NEED ? more : MOST_NEED);
+}
+
 static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int64_t slot,
                              electorate *who)
 {
     const dtsa_table *table = agent->table;
     const int self = agent->self;
     int resting = 0, settled = 0;
+    double innovation = 0.0; /* of the frame that is being made */
+    for (int i = 0; i < 3; i++)
+        innovation += fabs(agent->velocity[i] - table->sent_v[i * v->n + self]);
     who->last = (int64_t *)(void *)table->scratch;
     who->next = who->last + v->n;
-    who->again = (uint16_t *)(who->next + v->n);
+    who->need = (int32_t *)(void *)(who->next + v->n);
+    who->again = (uint16_t *)(who->need + v->n);
     who->able = (uint8_t *)(who->again + v->window);
     who->rests = who->able + v->n;
     who->sure = who->rests + v->n;
@@ -94,6 +108,7 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
         who->sure[k] = who->rests[k] && (k == self ? agent->final : presumed || v->settled[k]);
         settled += who->sure[k];
         who->last[k] = table->sent_slot[k] < 0 ? slot - v->n : table->sent_slot[k];
+        who->need[k] = need(k == self ? innovation : table->innovation[k]);
     }
     who->informed = slot >= v->n || table->config->targets_known;
     const int few_move = settled && settled == resting && 3 * who->members < v->n;
@@ -112,14 +127,15 @@ static int count_absent_before(const lease_scope *v, int64_t slot)
 }
 
 /* What a turn is worth to an agent: its wait before it, times the wait that follows, as far as that
- * is short.
+ * is short, times its need.
  *
  * next: slot in which it is known to send after the turn. */
 static long worth(const lease_scope *v, const electorate *who, int k, int64_t turn, int64_t next)
 {
     const int most = who->lends ? (3 * who->members + 3) / 4 : who->members;
     const int64_t wait = turn - who->last[k], rest = next - turn;
-    return (wait <= v->n ? (long)wait : v->n + 1) * (rest < most ? (long)rest : most);
+    return (wait <= v->n ? (long)wait : v->n + 1) * (rest < most ? (long)rest : most) *
+           who->need[k];
 }
 
 /* To whom a turn is worth most. -1: nobody is able. */
@@ -137,19 +153,12 @@ static int choose_lessee(const lease_scope *v, const electorate *who, int64_t tu
     return best;
 }
 
-/* Whether a turn stays with an owner that rests and may get another goal: it must be heard soon
- * when it wakes. */
-static int is_kept(const lease_scope *v, int64_t turn)
-{
-    return (turn / v->n + turn % v->n) % KEPT_EVERY == 0 || lease_is_anchor(v, turn);
-}
-
 /* Whether a turn is one that its owner gives away, as far as is known. */
 static int is_spare(const lease_scope *v, const electorate *who, int64_t turn)
 {
     const int owner = (int)(turn % v->n);
     if (!who->rests[owner] || turn < v->n) return 0;
-    return who->sure[owner] ? !lease_is_main(v, turn) : !is_kept(v, turn);
+    return who->sure[owner] ? !lease_is_main(v, turn) : !lease_is_anchor(v, turn);
 }
 
 /* Whether a turn is one that a mover gives away, or keeps, as it is worth most; as far as is known.
@@ -215,18 +224,6 @@ static void foresee(const lease_scope *v, electorate *who, int64_t from, int64_t
     }
 }
 
-/* Whether a turn is this agent's to give away now.
- *
- * reach: so many rounds ahead the turns of its owner are. */
-static int may_give(const dtsa_agent *agent, const lease_scope *v, int64_t slot, int64_t turn,
-                    int reach)
-{
-    const int idle = v->a->idle_since >= 0, mine = turn % v->n == v->self;
-    if (v->lessee[turn % v->window] != LEASE_NONE || v->a->probation) return 0;
-    if (mine && idle && !agent->final && is_kept(v, turn)) return 0;
-    return (turn - slot + v->n - 1) / v->n <= reach;
-}
-
 /* To whom a turn is given; LEASE_NONE: to nobody, it is kept.
  *
  * from: the first slot whose sender has not been foreseen; `slot` + 1 at first. */
@@ -274,7 +271,8 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
         const int mine = turn % v->n == v->self;
         uint8_t *given = &v->lessee[turn % v->window];
         if (mine && !(agent->final && idle) && lease_is_anchor(v, turn)) own = 0;
-        if (may_give(agent, v, slot, turn, mine ? own : adopted)) {
+        const int rounds = (int)((turn - slot + v->n - 1) / v->n); /* ahead, rounded up */
+        if (*given == LEASE_NONE && !v->a->probation && rounds <= (mine ? own : adopted)) {
             *given = choose_heir(v, &who, slot, turn, &from);
             if (*given != LEASE_NONE) v->issuer[turn % v->window] = (uint8_t)(v->self + 1);
         }
@@ -376,6 +374,7 @@ void lease_fill(dtsa_agent *agent, int64_t slot, extended_frame *e)
     e->probation = v.a->probation;
     e->leaving = own_turn && agent->present == PRESENT_LEAVING;
     v.a->leaving = (uint8_t)e->leaving;
+    v.a->spoke = slot;
     if (agent->table->config->lease.adoption && !v.a->probation && !e->leaving)
         e->c_s = count_absent_before(&v, slot);
     if (own_turn) issue(agent, &v, slot, e);
