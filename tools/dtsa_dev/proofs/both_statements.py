@@ -14,7 +14,7 @@ from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_dev.protocol.experiment import random_schedule
 
-POLICIES = ("tdma", "dtsa", "age", "aloha", "lease", "lease")
+POLICIES = ("tdma", "dtsa", "age", "aloha", "innovation", "lease", "lease")
 ESTIMATORS = ("hold", "linear", "intent", "oracle")
 AVOIDERS = ("orca", "potential", "bvc", "none", "crazyflie", "jerky", "bvc-firmware")
 SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")

@@ -263,8 +263,11 @@ static void write_handed(int sender, const extended_frame *e)
         ledger *entry = &book[turn % MOST_WINDOW];
         if (!(entry->holders >> sender & 1) || lessee == LEASE_OPEN ||
             entry->holders & bit_of(lessee))
-            continue; /* relayed */
-        rule(lessee - 1 != turn % n, "3: hands no turn on to its owner");
+            continue;                 /* relayed */
+        if (lessee - 1 == turn % n) { /* an adopter may have given it the turn */
+            rule(entry->named & bit_of(lessee), "3: hands no turn on to its owner");
+            continue;
+        }
         rule(hands_on(), "2: hands a turn on where nobody may");
         rule(!main_anchor(turn), "4: hands a main anchor on");
         entry->holders = (uint8_t)((entry->holders & ~(1 << sender)) | bit_of(lessee));

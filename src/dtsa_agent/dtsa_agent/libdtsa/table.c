@@ -24,6 +24,7 @@ static void rehash(dtsa_table *t, int k)
         x = mix64(x ^ bits(t->sent_p[i * n + k]));
         x = mix64(x ^ bits(t->sent_v[i * n + k]));
     }
+    if (t->config->policy == DTSA_POLICY_INNOVATION) x = mix64(x ^ bits(t->innovation[k]));
     const uint32_t hash =
         (uint32_t)(x ^ x >> 32); /* players of bags refuse numbers that a double cannot hold */
     *t->hash ^= t->entry_hash[k] ^ hash;

@@ -51,7 +51,9 @@ class ReferenceSwarm(Swarm):
         super().__init__(config, scenario, local)
         self.rules = rules_of(config, self.scenario)
         start = _vectors(self.scenario.start)
-        self.agents = [Agent(int(k), self.rules, Table(int(k) + 1, start)) for k in self.local]
+        by_innovation = config.policy == "innovation"
+        tables = [Table(int(k) + 1, start, by_innovation=by_innovation) for k in self.local]
+        self.agents = [Agent(table.observer - 1, self.rules, table) for table in tables]
         for place in range(len(self.agents)):
             self._publish(place)
 

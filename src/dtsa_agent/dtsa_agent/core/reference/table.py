@@ -33,11 +33,13 @@ class Table:
     """What one observer knows.
 
     :param known_goals: where those that rest are taken to stand, m; None: nobody knows that.
+    :param by_innovation: decisions depend on the innovation, too, so digests do.
     """
 
     observer: int
     start: Sequence[Vector]
     known_goals: Sequence[Vector] | None = None
+    by_innovation: bool = False
     rows: list[Row] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -88,4 +90,6 @@ class Table:
         for axis in range(3):
             x = mix64(x ^ bits_of(row.position[axis]))
             x = mix64(x ^ bits_of(row.velocity[axis]))
+        if self.by_innovation:
+            x = mix64(x ^ bits_of(row.innovation))
         row.digest = (x ^ x >> 32) & 0xFFFFFFFF

@@ -161,6 +161,8 @@ class Ledger:
         if handed is None or sender not in handed.holders or lessee in handed.holders:
             return
         if lessee in (OPEN, turn % self.agents + 1) or self._is_main(turn):
+            if lessee in handed.named:  # a relay of another one that gave it away
+                return
             self.broken.append(f"slot {slot}: agent {sender} hands turn {turn} on to {lessee}")
             return
         handed.holders.remove(sender)

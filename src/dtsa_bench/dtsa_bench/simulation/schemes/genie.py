@@ -26,6 +26,23 @@ class GenieAge:
         return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
 
 
+class GenieInnovation:
+    """:class:`GenieAge`, where the ages of an agent are weighed by the change of velocity in its last frame.
+
+    An agent that brakes or swerves has sent a velocity that it will not keep, so it is heard again soon.
+    """
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del config, agent
+
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
+        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        age = np.where(counts(swarm), ages(swarm, slot), 0.0).sum(axis=0)
+        weight = age * (0.02 + np.diagonal(swarm.innovation))
+        best = int(weight.argmax())
+        return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
+
+
 class Whittle:
     """The agent with the largest sum of Whittle's indices of the true ages at all receivers.
 
