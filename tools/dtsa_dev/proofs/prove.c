@@ -11,7 +11,6 @@
  *                                              (contents; choose_lessee is prove_lessee)
  *   whether a turn is handed on, and to whom           (contents; choose_next is prove_next)
  *   which turns are OPEN                               (contents; is_open is prove_open)
- *   whether a mover gives turns away                   (contents; it may always, and need not)
  *   whom a speaker thinks dead, and whether a hearer thought it dead
  *                                              (all that absence, silence and gossip can lead to)
  *   whether the wait that ends probation with adoption is over         (ages)
@@ -393,8 +392,7 @@ static void speak(int k, uint8_t *frame)
         a->table->in_ap[other] = 1;
         v.miss[other] = v.quiet[other] = 0;
     }
-    /* moving, those up to its next anchor given away or not; idle, all of its turns given away;
-     * idle, none of them */
+    /* moving; idle, all of its turns given away; idle, none of them */
     const int mood = own && !v.a->probation ? choose(dead ? 3 : 2) : 0;
     v.a->moving = mood == 0;
     v.a->idle_since = mood ? slot : -1;

@@ -150,7 +150,7 @@ def test_an_own_entry_holds_nothing_that_was_sent_in_an_open_turn_unheard(statem
 
 @STATEMENTS
 def test_a_relay_leaves_out_own_turns_that_the_same_frame_names(statement: Any) -> None:
-    flight = fly(statement, 12, 3).run(600)
+    flight = fly(statement, 12, 3).run(800)
     naming = {slot: frame for slot, frame in flight.frames.items() if any(frame.leases)}
     assert len(naming) > 50
     for slot, frame in naming.items():

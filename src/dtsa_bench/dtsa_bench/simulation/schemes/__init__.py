@@ -17,6 +17,6 @@ from .threshold_aoii import ThresholdAoii
 from .unslotted import Beacons, Csma, PureAloha
 
 __all__ = [
-    "Beacons", "Csma", "Dominance", "Dtr", "EventTdma", "GenieAge", "GenieError", "GenieInnovation", "Mixer", "PureAloha",
-    "Sense", "Sotdma", "ThresholdAloha", "ThresholdAoii", "Whittle",
+    "Beacons", "Csma", "Dominance", "Dtr", "EventTdma", "GenieAge", "GenieError", "GenieInnovation", "Mixer",
+    "PureAloha", "Sense", "Sotdma", "ThresholdAloha", "ThresholdAoii", "Whittle",
 ]  # fmt: skip

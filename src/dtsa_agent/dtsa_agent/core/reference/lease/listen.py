@@ -82,7 +82,6 @@ def note_silence(memory: Memory, slot: int) -> None:
     k = memory.expected
     if k < 0 or memory.missed[k] >= MISSED or memory.absent(k, slot):
         return
-    memory.lost += 1.0
     if memory.silence <= DEAF:
         memory.silence += 1
     if memory.silence <= DEAF:

@@ -9,7 +9,6 @@ from dtsa_agent.core.reference.rules import Rules
 
 DEAF = 4  # more silent slots in a row than this, and an agent is presumed deaf
 MISSED = 4  # who missed so many expected turns gets no leases
-ROUNDS = 8  # in which missed frames are counted
 GONE = -(2**61)  # in ``heard``: said that it leaves
 HANDED = 255  # in place of an issuer: the agent itself was given the turn, and has handed it on
 NEVER = -1  # in ``heard``, ``woke``, ``idle_since``, ``spoke``
@@ -45,7 +44,6 @@ class Memory:
     woke: int = NEVER  # slot in which it woke or joined, and since when nobody is known to have heard it
     attempts: int = 0  # frames in OPEN turns since then
     wakers: float = 0.0  # w: about so many agents woke in the last N slots
-    lost: float = 0.0  # about so many frames were missed in the last 8 N slots
     silence: int = 0  # own silence: silent slots in a row
     expected: int = -1  # who was expected in this slot, -1: nobody in particular
     heard_now: bool = False  # something was heard in this slot
@@ -164,9 +162,8 @@ class Memory:
             self.woke = slot
 
     def roll(self, self_index: int, slot: int) -> None:
-        """A slot begins: earlier turns are over; the estimates of how many woke and of missed frames fall."""
+        """A slot begins: earlier turns are over; the estimate of how many woke falls."""
         for turn in [turn for turn in self.leases if turn < slot]:
             del self.leases[turn]
         self.now = self.heard[self_index] = slot
         self.wakers -= self.wakers / self.rules.agents
-        self.lost -= self.lost / (ROUNDS * self.rules.agents)

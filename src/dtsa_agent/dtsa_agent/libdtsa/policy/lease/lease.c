@@ -142,7 +142,6 @@ static void roll(lease_scope *v, int64_t slot)
     }
     a->now = v->heard[v->self] = slot;
     a->wakers -= a->wakers / v->n;
-    a->lost -= a->lost / (LEASE_MEMORY * v->n);
 }
 
 static void lease_begin(dtsa_agent *agent)
@@ -337,7 +336,6 @@ static void note_silence(const lease_scope *v, int64_t slot)
     if (a->expected < 0 || v->miss[a->expected] >= LEASE_MISSED ||
         lease_absent(v, a->expected, slot))
         return;
-    a->lost += 1.0;
     if (a->deaf <= LEASE_DEAF) a->deaf++;
     if (a->deaf <= LEASE_DEAF) v->miss[a->expected]++;
 }

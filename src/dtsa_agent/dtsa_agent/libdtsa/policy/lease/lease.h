@@ -7,7 +7,6 @@
 enum {
     LEASE_DEAF = 4,   /* more silent slots in a row than this, and an agent is presumed deaf */
     LEASE_MISSED = 4, /* who missed so many expected turns gets no leases */
-    LEASE_MEMORY = 8, /* rounds in which missed frames are counted */
     LEASE_HANDED =
         255 /* in place of an issuer: this agent was given the turn, and has handed it on */
 };
@@ -23,7 +22,6 @@ typedef struct lease_agent {
     int64_t claimed; /* slot in which probation began or was last confirmed */
     int64_t spoke;   /* slot of the last frame of its own, -1: none */
     double wakers;   /* agents that woke lately: about so many in the last n slots */
-    double lost;     /* frames missed lately: about so many in the last 8 n slots */
     int32_t expected; /* 0-based agent expected in this slot, -1: nobody in particular */
     int32_t deaf;     /* silent slots in a row */
     uint8_t started, heard_now, probation, anchored, attempts, moving, leaving;
