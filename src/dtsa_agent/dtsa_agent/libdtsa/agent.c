@@ -258,7 +258,7 @@ void agent_steer(dtsa_agent *a, int64_t slot, int step)
     if (c->avoid.margin_rate > 0.0) {
         const double dt = c->slot_s / c->steps;
         for (int k = 0; k < c->agents; k++)
-            t->ages[k] = t->sent_slot[k] < 0
+            t->ages[k] = t->sent_slot[k] < 0 || !t->in_ap[k] /* it rests where it was heard */
                              ? 0.0
                              : (double)(slot - t->sent_slot[k]) * c->slot_s + step * dt;
         ages = t->ages;

@@ -219,17 +219,17 @@ def test_open_turns_visit_all_owners() -> None:
         period = SwarmConfig(agents=agents, moving=0, policy="lease").open_period
         assert period == max(11, agents // 5)
         for resting in {1, agents // 3, agents} - {0}:
-            block = open_block(agents, period, resting)
-            assert np.gcd(block, agents) == 1
-            assert block >= period * agents / resting
+            blocks = [open_block(agents, period, resting, settled) for settled in (0, resting)]
+            assert all(np.gcd(block, agents) == 1 for block in blocks)
+            assert period * agents / resting <= blocks[0] <= blocks[1]
     assert SwarmConfig(policy="lease", open_every=0).open_period == 0
-    assert open_block(12, 0, 6) == open_block(12, 11, 0) == 0
+    assert open_block(12, 0, 6, 6) == open_block(12, 11, 0, 0) == 0
 
 
 def test_open_turns_are_spaced_evenly() -> None:
     """So who wakes waits for one block at most, the odd one that is nobody's apart."""
     air = Air(make(40, 10, open_every=20)).run(3000)
-    block = open_block(40, 20, 30)
+    block = open_block(40, 20, 30, 30)
     opened = [slot for slot in range(3000, 3600) if air.run(1).swarm.reason_name(0) == "open"]
     assert len(opened) >= 0.9 * 600 / block
     assert max(np.diff(opened)) < 2 * block

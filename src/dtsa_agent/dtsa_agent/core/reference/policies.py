@@ -55,10 +55,10 @@ def choose(table: Table, slot: int, rules: Rules, weights: Weights | None = None
     longest = oldest(h, members)
     if rules.policy == "age":
         return Choice(longest, "oldest")
-    if rules.policy == "innovation":
-        return Choice(max(members, key=lambda k: h[k] * (STRAIGHT + table.rows[k].innovation)), "innovation")
     if rules.age_cap > 0.0 and h[longest] >= rules.age_cap * len(members):
         return Choice(longest, "age-cap")
+    if rules.policy == "innovation":
+        return Choice(max(members, key=lambda k: h[k] * (STRAIGHT + table.rows[k].innovation)), "innovation")
     return choose_by_priority(table, slot, rules, weights)
 
 

@@ -11,7 +11,10 @@ static choice innovation_decide(dtsa_agent *a, int64_t slot)
     double most = -1.0;
     const choice back = choose_outside(t, slot);
     if (back.index >= 0) return back;
-    if (!count_members(a->table, slot, &oldest)) return choose_nobody();
+    const int members = count_members(a->table, slot, &oldest);
+    if (!members) return choose_nobody();
+    if (t->config->age_cap > 0.0 && (double)t->h[oldest] >= t->config->age_cap * members)
+        return (choice){oldest, DTSA_REASON_AGE_CAP, 0.0};
     for (int k = 0; k < t->config->agents; k++) {
         const double value = (double)t->h[k] * (STRAIGHT + t->innovation[k]);
         if (!t->in_ap[k] || value <= most) continue;

@@ -12,6 +12,7 @@ from dtsa_agent.core.reference.table import Table
 from .memory import HANDED, MISSED, Lease, Memory
 
 NEED, MOST_NEED = 50.0, 6000.0  # NEED: s/m
+MORE = 2  # a mover hands on turns that are worth so many times as much to another agent
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,7 @@ def electorate(memory: Memory, self_index: int, table: Table, slot: int, velocit
     settled[self_index] = rests[self_index] and final
     informed = slot >= memory.rules.agents or table.known_goals is not None
     last = [row.sent_slot if row.sent_slot >= 0 else slot - memory.rules.agents for row in rows]
-    block = open_block(memory.rules.agents, memory.rules.open_every, sum(rests))
+    block = open_block(memory.rules.agents, memory.rules.open_every, sum(rests), sum(settled))
     innovation = [row.innovation for row in rows]
     innovation[self_index] = norm1(minus(velocity, rows[self_index].velocity))  # of the frame that is being made
     return Electorate(
@@ -108,7 +109,8 @@ def need_of(innovation: float) -> int:
 def is_presumed(memory: Memory, table: Table, k: int, slot: int) -> bool:
     """Whether nothing is known of an agent but where it starts and wants to be: in the first round."""
     first_round = memory.born == 0 and slot < memory.rules.agents
-    return first_round and table.known_goals is not None and table.rows[k].sent_slot < 0
+    unheard = table.rows[k].sent_slot < 0 and not memory.absent(k, slot)
+    return first_round and table.known_goals is not None and unheard
 
 
 def sets_out(memory: Memory, table: Table, k: int) -> bool:
@@ -117,18 +119,22 @@ def sets_out(memory: Memory, table: Table, k: int) -> bool:
     return norm(minus(table.known_goals[k], table.start[k])) > memory.rules.r_min
 
 
-def open_block(agents: int, every: int, resting: int) -> int:
+def open_block(agents: int, every: int, resting: int, settled: int) -> int:
     """Slots of which one turn goes to agents that wake: S turns of those that rest lie in so many; 0: none.
 
-    It has no factor in common with N, or the same few owners would always pay.
+    Half as many more where all of them are settled. It has no factor in common with N, or the same few owners would
+    always pay.
 
     :param agents: N, number of agents.
     :param every: S, number of turns of those that rest of which one is an OPEN turn.
     :param resting: number of those that rest.
+    :param settled: number of those of them that know that they will rest.
     """
     if not every or not resting:
         return 0
     block = -(-every * agents // resting)  # rounded up
+    if settled == resting:
+        block += block // 2
     while math.gcd(block, agents) > 1:
         block += 1
     return block
@@ -252,7 +258,7 @@ def hand_on(
 
     If it rests, all within reach that come before its last turn there, in which it can hand on further ones; beyond the
     relay's reach all to one agent, to whom the first of them is worth most. If it moves, those within the relay's reach
-    that are worth more to another agent. The turn's owner, which has given it away, is left out.
+    that are worth much more to another agent. The turn's owner, which has given it away, is left out.
 
     :param leases: the frame's lease bytes; with more than one section of them there is no room for a far lessee.
     :returns: the turns handed on; at most eight within the relay's reach, the others to one agent.
@@ -282,7 +288,7 @@ def hand_on(
             k = choose_lessee(memory, who, turn, but=self_index)
         if k < 0 or k == memory.owner(turn):
             continue
-        if idle or worth(memory, who, k, turn) >= worth(memory, who, self_index, turn):
+        if idle or worth(memory, who, k, turn) >= MORE * worth(memory, who, self_index, turn):
             memory.leases[turn] = Lease(k + 1, HANDED)
             handed.append(turn)
             heir = k if far else -1

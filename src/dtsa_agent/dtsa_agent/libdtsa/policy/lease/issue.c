@@ -7,6 +7,8 @@
 
 static const double NEED = 50.0, MOST_NEED = 6000.0; /* NEED: s/m */
 
+enum { MORE = 2 }; /* a mover hands on turns that are worth so many times as much to another one */
+
 typedef struct {
     int alive;       /* N_alive: me and those heard of lately */
     int members;     /* N_p: those in A_p that do not miss their turns */
@@ -22,12 +24,14 @@ typedef struct {
     uint8_t *list;   /* (members) those able */
 } electorate;
 
-/* Slots of which one turn goes to agents that wake: S turns of those that rest lie in so many. No
- * factor in common with n, or the same few owners would always pay. */
-static int open_block(int every, const lease_scope *v, int resting)
+/* Slots of which one turn goes to agents that wake: S turns of those that rest lie in so many; half
+ * as many more where all of them are settled. No factor in common with n, or the same few owners
+ * would always pay. */
+static int open_block(int every, const lease_scope *v, int resting, int settled)
 {
     if (!every || !resting) return 0;
     int block = (every * v->n + resting - 1) / resting;
+    if (settled == resting) block += block / 2;
     while (common_factor((uint64_t)block, (uint64_t)v->n) > 1) block++;
     return block;
 }
@@ -37,7 +41,7 @@ static int is_presumed(const dtsa_agent *agent, const lease_scope *v, int k, int
 {
     const dtsa_table *table = agent->table;
     return v->a->born == 0 && slot < v->n && table->config->targets_known && k != agent->self &&
-           table->sent_slot[k] < 0;
+           table->sent_slot[k] < 0 && !lease_absent(v, k, slot);
 }
 
 /* Whether an agent has something to say when it starts. */
@@ -65,7 +69,7 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
 {
     const dtsa_table *table = agent->table;
     const int self = agent->self;
-    int resting = 0;
+    int resting = 0, settled = 0;
     double innovation = 0.0; /* of the frame that is being made */
     for (int i = 0; i < 3; i++)
         innovation += fabs(agent->velocity[i] - table->sent_v[i * v->n + self]);
@@ -90,11 +94,12 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
         who->alive += alive;
         resting += who->rests[k];
         who->sure[k] = who->rests[k] && (k == self ? agent->final : presumed || v->settled[k]);
+        settled += who->sure[k];
         who->last[k] = table->sent_slot[k] < 0 ? slot - v->n : table->sent_slot[k];
         who->need[k] = need(k == self ? innovation : table->innovation[k]);
     }
     who->informed = slot >= v->n || table->config->targets_known;
-    who->block = open_block(table->config->lease.open_every, v, resting);
+    who->block = open_block(table->config->lease.open_every, v, resting, settled);
 }
 
 /* Number of consecutive ids before me that nobody has heard of for long. */
@@ -226,14 +231,14 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
     }
 }
 
-/* To whom this agent hands a turn on that it was given: if it rests, or the turn is worth more to
- * that one. -1: to nobody. Its owner has given it away. */
+/* To whom this agent hands a turn on that it was given: if it rests, or the turn is worth much more
+ * to that one. -1: to nobody. Its owner has given it away. */
 static int choose_next(const lease_scope *v, const electorate *who, int idle, int64_t turn)
 {
     const int k = choose_lessee(v, who, turn);
     if (k < 0 || k == v->self || k == turn % v->n) return -1;
     const long own = worth(v, who, v->self, turn, turn + who->again[turn % v->window]);
-    return idle || worth(v, who, k, turn, who->next[k]) >= own ? k : -1;
+    return idle || worth(v, who, k, turn, who->next[k]) >= MORE * own ? k : -1;
 }
 
 /* Hands a turn on to another agent, by its index. */
@@ -246,7 +251,7 @@ static void hand(lease_scope *v, electorate *who, int64_t turn, int k)
 
 /* Hands on turns that this agent was given. If it rests: all within reach that come before its last
  * turn there, in which it can hand on further ones; beyond the relay's reach all to one agent, to
- * whom the first of them is worth most. If it moves: those that are worth more to another one. Not
+ * whom the first of them is worth most. If it moves: those that are worth much more to another one. Not
  * the next slot's: frames may arrive late.
  *
  * -> mask of the turns handed on, as in relay_mask; e->far_* says those beyond. */
