@@ -19,14 +19,9 @@ EXAMPLES = (("", "all worlds, then the broken rules"), ("--mutants", "the broken
 _SPEED = "-O2"
 ANY = -1  # any number of times
 # Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody, also when it is
-# handed on), which are OPEN, and whether movers give turns away (they may).
-_CHOICE, _FREE_CHOICE = (
-    "k = choose_lessee(v, who, turn);\n    if (mine",
-    "k = prove_lessee(who->able, v->n);\n    if (mine",
-)
+# handed on), and which are OPEN.
+_CHOICE, _FREE_CHOICE = "(choose_lessee(v, who, turn) + 1)", "(prove_lessee(who->able, v->n) + 1)"
 _OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, who, turn)", "mine && prove_open()"
-_LENDS, _FREE_LENDS = "few_move && v->a->lost < FEW;", "(few_move || 1);"
-_KEEPS = "(!idle && keeps(v, who, turn))"
 _NEXT, _FREE_NEXT = "choose_next(v, &who, idle, turn)", "prove_next(who.able, v->self, v->n)"
 _LAST, _EACH = "turn < last + !idle;", "turn <= last;"
 _REACH = "RELAY_REACH = 24"
@@ -147,7 +142,7 @@ MUTANTS = (
         "lease.adoption && !v.a->probation && ", "lease.adoption && ", _ADOPTS,
     ),
     Mutant(
-        "what others relay changes no entry", "lease.c", "} else if (sender == *there) {", "} else if (1) {", _RELAYS,
+        "what others relay changes no entry", "lease.c", "} else if (sender == *known) {", "} else if (1) {", _RELAYS,
     ),
     Mutant(
         "no turn is handed on to its owner", "issue.c",
@@ -158,8 +153,7 @@ MUTANTS = (
         "agent->table->config->lease.adoption && !v.a->probation", "!v.a->probation", World("dies", 2),
     ),
     Mutant(
-        "an agent that has handed a turn on never takes it for its own again", "lease.c",
-        "(given || handed)", "(given && !handed)", _HANDS,
+        "an owner does not change what its lessee has handed on", "lease.c", "!from_me && issuer", "issuer", _RELAYS,
     ),
 )  # fmt: skip
 
@@ -205,8 +199,6 @@ def build(directory: Path, mutant: Mutant | None = None, relay_reach: int = 24) 
     shutil.copytree(LIBRARY / "policy" / "lease", lease, dirs_exist_ok=True)
     _replace(lease / "issue.c", _CHOICE, _FREE_CHOICE)
     _replace(lease / "issue.c", _OPEN_TURN, _FREE_OPEN_TURN)
-    _replace(lease / "issue.c", _LENDS, _FREE_LENDS)
-    _replace(lease / "issue.c", _KEEPS, "0")
     _replace(lease / "issue.c", _NEXT, _FREE_NEXT)
     _replace(lease / "issue.c", _LAST, _EACH)
     _replace(lease / "issue.c", _HEADER, f"{_HEADER}{_DECLARED}")

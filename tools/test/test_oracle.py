@@ -18,7 +18,7 @@ def test_flights_are_equal(seed: int) -> None:
     assert fly_both(setting)["slots"] == setting.slots
 
 
-@pytest.mark.parametrize("seed", [10, 36])
+@pytest.mark.parametrize("seed", [11, 36])
 def test_flights_are_equal_in_which_the_dead_are_adopted_and_some_come_back(seed: int) -> None:
     figures = fly_both(random_setting(seed, "lease", lasts=True))
     assert figures["reasons"]["adopted"] > 100
@@ -27,7 +27,6 @@ def test_flights_are_equal_in_which_the_dead_are_adopted_and_some_come_back(seed
 
 @pytest.mark.parametrize("moving", [2, 3])
 def test_flights_are_equal_in_which_few_of_many_move(moving: int) -> None:
-    """Movers give turns of their own away, and keep those that are worth most to themselves."""
     swarm = SwarmConfig(agents=12, moving=moving, policy="lease", avoider="none", axis_x_m=20.0, seed=3)
     figures = fly_both(Setting(swarm, ChannelConfig(agents=12, seed=3), 300))
     assert {"own", "anchor", "leased", "open"} <= set(figures["reasons"])
@@ -35,7 +34,7 @@ def test_flights_are_equal_in_which_few_of_many_move(moving: int) -> None:
 
 @pytest.mark.parametrize(
     ("module", "name", "value"),
-    [(issue, "MISSED", 1), (issue, "RELAY_IDS", 1), (listen, "DEAF", 0), (issue, "OFTEN", 50.0)],
+    [(issue, "MISSED", 1), (issue, "RELAY_IDS", 1), (listen, "DEAF", 0), (issue, "NEED", 1.0)],
 )
 def test_a_rule_that_differs_is_found(monkeypatch: pytest.MonkeyPatch, module: object, name: str, value: float) -> None:
     """The oracle itself: one constant of the specification changed."""

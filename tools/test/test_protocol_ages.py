@@ -75,7 +75,7 @@ def test_lease_is_younger_than_tdma(agents, movers, warmup, more, ceiling):
         assert out.ledger is not None
         assert out.ledger.broken == []
         assert out.collisions == out.ledger.open_collisions + out.ledger.adopted_collisions
-    assert sum(out.collisions for out in flown) <= 0.001 * sum(out.slots for out in flown)
+    assert sum(out.collisions for out in flown) <= 0.002 * sum(out.slots for out in flown)
 
 
 def test_plain_dtsa_falls_apart_with_the_first_losses() -> None:

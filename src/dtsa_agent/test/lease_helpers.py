@@ -81,5 +81,5 @@ class Air:
         return sum(sum(b > 0 for b in self.frames[t].leases) for t in range(first, last) if t in self.frames)
 
 
-def is_anchor(slot: int, agents: int, every: int = 5) -> bool:
+def is_anchor(slot: int, agents: int, every: int = 3) -> bool:
     return Memory(Rules(agents=agents, slot_s=0.01, anchor_every=every)).is_anchor(slot)

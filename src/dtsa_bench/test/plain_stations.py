@@ -7,6 +7,7 @@ from typing import Any
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference import station as reference
 from dtsa_agent.core.reference.agent import Agent
+from dtsa_agent.core.reference.arithmetic import Vector
 from dtsa_agent.core.reference.rules import Rules
 from dtsa_agent.core.reference.table import Table
 from dtsa_bench.simulation.live import LiveFlight, S, _c_flight, fly
@@ -26,8 +27,9 @@ def compare_statements(flight: LiveFlight) -> int:
 def rules_of(flight: LiveFlight) -> Rules:
     """What ``_c_flight`` sets, in plain Python."""
     return Rules(
-        agents=flight.agents, slot_s=flight.slot_ns / S, policy=flight.policy, key=5, depth_rate=0.2,
-        profile="extended" if flight.policy == "lease" else "paper", main_every=15, anchor_every=5, open_every=11,
+        agents=flight.agents, slot_s=flight.slot_ns / S, policy=flight.policy, key=5, depth_rate=0.5,
+        profile="extended" if flight.policy == "lease" else "paper", main_every=15, anchor_every=flight.anchor_every,
+        open_every=11,
     )  # fmt: skip
 
 
@@ -38,6 +40,7 @@ class PlainStations:
         n = flight.agents
         self.fault = ""
         self.flight, self.calls, self.stations = flight, 0, dict[int, reference.Station]()
+        self.coasts = dict[int, Vector | None]()  # velocity that the process of each host did not command
         self._c, self._kept = _c_flight(flight)
         places = self._c.config.start, self._c.config.target
         self._start, self._away = ([(at[k], at[n + k], at[2 * n + k]) for k in range(n)] for at in places)
@@ -53,6 +56,7 @@ class PlainStations:
         self.calls += 1
         if call.kind == STARTED:
             self.stations[call.host] = self._open(call)
+            self.coasts.pop(call.host, None)
         station = self.stations[call.host]
         at = f"call {self.calls}, host {call.host}, slot {station.slot}"
         if call.kind == RECEIVED:
@@ -61,7 +65,9 @@ class PlainStations:
         elif call.kind == STEPPED:
             agent = station.agent
             agent.position, agent.velocity = tuple(call.position), tuple(call.velocity)
-            agent.command = agent.velocity
+            # A vehicle flies on until its new process commands it.
+            if agent.velocity != self.coasts.setdefault(call.host, agent.velocity):
+                agent.command, self.coasts[call.host] = agent.velocity, None
             due, datagram = station.step(call.now_ns)
             expected = bytes(ffi.buffer(call.out, call.out_length)) if call.out_length else b""
             assert (due, datagram.hex()) == (call.answer, expected.hex()), at

@@ -14,7 +14,7 @@ from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_dev.protocol.experiment import random_schedule
 
-POLICIES = ("tdma", "dtsa", "age", "aloha", "lease", "lease")
+POLICIES = ("tdma", "dtsa", "age", "aloha", "innovation", "lease", "lease")
 ESTIMATORS = ("hold", "linear", "intent", "oracle")
 AVOIDERS = ("orca", "potential", "bvc", "none", "crazyflie", "jerky", "bvc-firmware")
 SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
@@ -28,8 +28,8 @@ _OF_AGENTS = (
     "chosen", "reason", "score", "digest", "sends", "present", "position", "velocity", "command", "track",
 )  # fmt: skip
 _OF_TABLES = (
-    "sent_position", "sent_velocity", "sent_intent", "sent_slot", "last_turn", "in_ap", "entry_hash", "table_hash",
-    "priority", "counter",
+    "sent_position", "sent_velocity", "sent_intent", "innovation", "sent_slot", "last_turn", "in_ap", "entry_hash",
+    "table_hash", "priority", "counter",
 )  # fmt: skip
 _ESTIMATES = ("estimate_position", "estimate_velocity")
 

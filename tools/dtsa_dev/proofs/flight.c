@@ -38,7 +38,7 @@ static void configure(dtsa_config *c, int policy, int n)
     c->key = 12345;
     c->avoid = (dtsa_avoid_params){1.5,  2.0, 0.336, 1.0, 30.0, 0.2,  0.2, 1.31,
                                    0.33, 0.1, 0.3,   0.0, 0.3,  0.25, 1.0};
-    c->lease = (dtsa_lease_config){5, 11, 1, 0.1, 1.0, 0, 15};
+    c->lease = (dtsa_lease_config){3, 11, 1, 0.5, 1.0, 0, 15};
     for (int k = 0; k < n; k++) { /* a wavy square; most cross it, two rest */
         const double side = 0.8 * (k / 4 + 1), far = k < n - 2 ? -1.0 : 1.0;
         const double x = k & 1 ? side : -side, y = k & 2 ? 2.5 : -2.5, z = 1.0 + 0.1 * (k % 5);

@@ -11,7 +11,6 @@
  *                                              (contents; choose_lessee is prove_lessee)
  *   whether a turn is handed on, and to whom           (contents; choose_next is prove_next)
  *   which turns are OPEN                               (contents; is_open is prove_open)
- *   whether a mover gives turns away                   (contents; it may always, and need not)
  *   whom a speaker thinks dead, and whether a hearer thought it dead
  *                                              (all that absence, silence and gossip can lead to)
  *   whether the wait that ends probation with adoption is over         (ages)
@@ -95,10 +94,11 @@ enum { RESTART, DEATH, RETURN, CLAIM }; /* budgets */
 enum { PATIENCE = 6 };                  /* slots; only whether it is over counts */
 
 typedef struct ledger {
-    uint8_t owner;             /* what its owner gave the turn away as */
-    uint8_t others;            /* bit k: an adopter gave it to agent k */
-    uint8_t forgotten;         /* bit k: agent k has handed it on, in an earlier life */
-    uint8_t next[MOST_AGENTS]; /* id of the agent to whom each has handed it on, 0: it has not */
+    uint8_t owner;     /* what its owner gave the turn away as */
+    uint8_t others;    /* bit k: an adopter gave it to agent k */
+    uint8_t named;     /* bit k: it was given or handed on to agent k */
+    uint8_t holders;   /* bit k: to agent k last, one for each that gave it away */
+    uint8_t forgotten; /* bit k: agent k has handed it on, in an earlier life */
 } ledger;
 
 static dtsa_config config;
@@ -166,17 +166,8 @@ static int entry_byte(int lessee, int issuer)
     return (lessee == LEASE_OPEN ? 7 : lessee) | by << 3;
 }
 
-static void put_handed(const ledger *entry)
-{
-    put(entry->forgotten);
-    for (int k = 0; k < n; k++) put(entry->next[k]);
-}
-
-static void take_handed(ledger *entry)
-{
-    entry->forgotten = (uint8_t)take();
-    for (int k = 0; k < n; k++) entry->next[k] = (uint8_t)take();
-}
+/* Bit of an agent, by its id; OPEN and 0: none. */
+static int bit_of(int id) { return id && id != LEASE_OPEN ? 1 << (id - 1) : 0; }
 
 static int pack(uint8_t *out)
 {
@@ -187,7 +178,10 @@ static int pack(uint8_t *out)
         if (main_anchor(t)) continue;
         put(book[t % MOST_WINDOW].owner);
         if (config.lease.adoption) put(book[t % MOST_WINDOW].others);
-        if (hands_on()) put_handed(&book[t % MOST_WINDOW]);
+        if (!hands_on()) continue;
+        put(book[t % MOST_WINDOW].named);
+        put(book[t % MOST_WINDOW].holders);
+        put(book[t % MOST_WINDOW].forgotten);
     }
     for (int k = 0; k < n; k++) {
         const lease_scope v = lease_of(agents[k]);
@@ -210,9 +204,14 @@ static void unpack(const uint8_t *in)
     memset(book, 0, sizeof book);
     for (int64_t t = slot; t < slot + reach; t++) {
         if (main_anchor(t)) continue;
-        book[t % MOST_WINDOW].owner = (uint8_t)take();
-        if (config.lease.adoption) book[t % MOST_WINDOW].others = (uint8_t)take();
-        if (hands_on()) take_handed(&book[t % MOST_WINDOW]);
+        ledger *entry = &book[t % MOST_WINDOW];
+        entry->owner = (uint8_t)take();
+        if (config.lease.adoption) entry->others = (uint8_t)take();
+        entry->named = entry->holders = (uint8_t)(entry->others | bit_of(entry->owner));
+        if (!hands_on()) continue;
+        entry->named = (uint8_t)take();
+        entry->holders = (uint8_t)take();
+        entry->forgotten = (uint8_t)take();
     }
     for (int k = 0; k < n; k++) {
         agent_forget(agents[k]);
@@ -243,38 +242,6 @@ static void rule(int holds, const char *name)
     if (!holds && !broken) broken = name;
 }
 
-/* Whether a turn that was given away first to agent `first` (an id) is agent k's by now; each hands
- * it on once. */
-static int is_last(const ledger *entry, int first, int k)
-{
-    if (first == LEASE_OPEN || !first) return 0;
-    for (int i = 0; i < n && entry->next[first - 1]; i++) first = entry->next[first - 1];
-    return first == k + 1;
-}
-
-/* Whether a turn that was given away first to agent `first` was agent `id`'s then or later. */
-static int is_reached(const ledger *entry, int first, int id)
-{
-    for (int i = 0; i < n && first != id && first != LEASE_OPEN && first; i++)
-        first = entry->next[first - 1];
-    return first == id;
-}
-
-/* Whether agent k was given a turn, by its owner or an adopter, or by who had it before, and has
- * not handed it on. */
-static int is_given(const ledger *entry, int k)
-{
-    int given = is_last(entry, entry->owner, k);
-    for (int i = 0; i < n; i++) given |= entry->others >> i & 1 && is_last(entry, i + 1, k);
-    return given;
-}
-
-/* Whether agent k has been named for a turn before. */
-static int is_named(const ledger *entry, int k)
-{
-    return entry->owner == k + 1 || entry->others >> k & 1 || entry->next[k];
-}
-
 /* To whom a frame says that a turn is given, 0: it says nothing of it. `i` of the relay's ids have
  * been read. */
 static int said_of(const extended_frame *e, int d, int *i)
@@ -284,7 +251,8 @@ static int said_of(const extended_frame *e, int d, int *i)
     return e->far_mask[b >> 3] >> (b & 7) & 1 ? e->far_id : 0;
 }
 
-/* Turns that a frame hands on: whose turn it is names another one. */
+/* Turns that a frame hands on: whose turn it is names another one. One that does not know yet that
+ * it was named relays an earlier one, which then takes the turn again. */
 static void write_handed(int sender, const extended_frame *e)
 {
     for (int d = 1, i = 0; d < MOST_WINDOW && d <= FAR_REACH; d++) {
@@ -292,13 +260,17 @@ static void write_handed(int sender, const extended_frame *e)
         if (!lessee) continue;
         const int64_t turn = slot + d;
         ledger *entry = &book[turn % MOST_WINDOW];
-        if (!is_given(entry, sender) || lessee == sender + 1) continue;
-        if (lessee == LEASE_OPEN || is_named(entry, lessee - 1))
-            continue; /* relayed, from before */
-        rule(lessee - 1 != turn % n, "3: hands no turn on to its owner");
+        if (!(entry->holders >> sender & 1) || lessee == LEASE_OPEN ||
+            entry->holders & bit_of(lessee))
+            continue;                 /* relayed */
+        if (lessee - 1 == turn % n) { /* an adopter may have given it the turn */
+            rule(entry->named & bit_of(lessee), "3: hands no turn on to its owner");
+            continue;
+        }
         rule(hands_on(), "2: hands a turn on where nobody may");
         rule(!main_anchor(turn), "4: hands a main anchor on");
-        entry->next[sender] = (uint8_t)lessee;
+        entry->holders = (uint8_t)((entry->holders & ~(1 << sender)) | bit_of(lessee));
+        entry->named |= (uint8_t)bit_of(lessee);
     }
 }
 
@@ -316,12 +288,14 @@ static void write_given(int sender, const extended_frame *e)
             if (i ? anchor(turn) : !own) continue;
             const int given = place < e->lease_count ? e->leases[place++] : 0;
             if (!given) continue;
-            if (i)
-                entry->others |= (uint8_t)(1 << (given - 1));
-            else
-                rule(!entry->owner || is_reached(entry, entry->owner, given),
+            if (!i)
+                rule(!entry->owner || entry->owner == given || entry->named & bit_of(given),
                      "3: gives a turn away once");
-            if (!i && !entry->owner) entry->owner = (uint8_t)given;
+            if (i) entry->others |= (uint8_t)bit_of(given);
+            if (i ? entry->named & bit_of(given) : entry->owner) continue; /* said again */
+            if (!i) entry->owner = (uint8_t)given;
+            entry->named |= (uint8_t)bit_of(given);
+            entry->holders |= (uint8_t)bit_of(given);
         }
     rule(place >= e->lease_count || !e->leases[place],
          "4: gives no main anchor away, nothing beyond it");
@@ -349,7 +323,7 @@ static void judge(int sender, int probation, int64_t woke)
 {
     const ledger *entry = &book[slot % MOST_WINDOW];
     const int owner = slot % n == sender;
-    const int lent = is_given(entry, sender) || entry->forgotten >> sender & 1;
+    const int lent = (entry->holders | entry->forgotten) >> sender & 1;
     if (entry->owner == LEASE_OPEN && !lent)
         rule(woke >= 0 || taken_back(sender, probation), "2: only who wakes takes OPEN turns");
     rule(entry->owner != LEASE_OPEN || config.lease.open_every, "2: OPEN where there is none");
@@ -377,7 +351,7 @@ static void forget(int k)
 {
     for (int64_t t = slot; t < slot + reach; t++) {
         ledger *entry = &book[t % MOST_WINDOW];
-        if (entry->next[k]) entry->forgotten |= (uint8_t)(1 << k);
+        entry->forgotten |= (uint8_t)(entry->named & ~entry->holders & 1 << k);
     }
 }
 
@@ -418,8 +392,7 @@ static void speak(int k, uint8_t *frame)
         a->table->in_ap[other] = 1;
         v.miss[other] = v.quiet[other] = 0;
     }
-    /* moving, those up to its next anchor given away or not; idle, all of its turns given away;
-     * idle, none of them */
+    /* moving; idle, all of its turns given away; idle, none of them */
     const int mood = own && !v.a->probation ? choose(dead ? 3 : 2) : 0;
     v.a->moving = mood == 0;
     v.a->idle_since = mood ? slot : -1;
@@ -577,8 +550,7 @@ int main(int argc, char **argv)
     base = (1000 / period + 1) * (int64_t)period;
     if (reach > MOST_WINDOW / 2 || period + n > 250) return 2;
     start();
-    size = 5 + reach * (1 + config.lease.adoption + hands_on() * (1 + n)) +
-           n * (1 + reach); /* at most */
+    size = 5 + reach * (1 + config.lease.adoption + hands_on() * 3) + n * (1 + reach); /* at most */
     places_in_table = 2 * most + 7;
     states = malloc((size_t)most * (size_t)size);
     table = calloc((size_t)places_in_table, sizeof *table);

@@ -42,6 +42,7 @@ REASON_TEXTS: Mapping[str, str] = MappingProxyType(
         "open": "turn for whoever has just woken or joined; nobody in particular is expected",
         "absent": "the owner is thought dead, and nobody was given its turn",
         "probation": "the owner is new or was away, and may send at its anchors only",
+        "innovation": "of those that move the longest silent, weighed by how much its velocity has just changed",
     }
 )
 
@@ -206,6 +207,7 @@ _POLICIES = (
     PolicyRow("age", "age", may_share=True),
     PolicyRow("aloha", "aloha", may_join=True),
     PolicyRow("lease", "lease", may_join=True, says_leaving=True, probation=True, extended=True, agent_state=True),
+    PolicyRow("innovation", "innovation", may_share=True),
 )
 _ESTIMATORS = (
     EstimatorRow("hold"),

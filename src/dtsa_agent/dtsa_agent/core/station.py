@@ -124,7 +124,7 @@ def parse_quorum(text: str) -> tuple[int, float]:
 def _limits(config: SwarmConfig) -> tuple[int, int]:
     """Slots after which an agent counts as silent: one that moves, one that rests; 0: what libdtsa says."""
     row, round_ = config.policy_row, config.agents
-    turn = max(2 * config.anchor_every * round_, round(0.5 / config.slot_s))
+    turn = max(2 * config.heard_every * round_, round(0.5 / config.slot_s))
     if "received" in row.port and not row.extended:  # agents send by chance, and those that have arrived need not
         return max(turn, 6 * config.main_every * round_), FOR_EVER
     return (0, 0) if row.extended else (turn, turn)
@@ -167,8 +167,8 @@ class StationSettings:
         lease = {"anchor_every": config.anchor_every, "main_every": config.main_every, "open_every": config.open_period}
         cycle = lib.dtsa_slot_cycle(ffi.new("dtsa_config *", {"agents": config.agents, "lease": lease}))
         self.c = ffi.new("dtsa_station_settings *", {
-            "id": id, "agents": config.agents, "anchor_every": config.anchor_every,
-            "main_every": config.main_every if rests else config.anchor_every, "slot_cycle": cycle,
+            "id": id, "agents": config.agents, "anchor_every": config.heard_every,
+            "main_every": config.main_every if rests else config.heard_every, "slot_cycle": cycle,
             "extended": config.extended, "own_bytes": config.own_bytes,
             "frame_length": config.frame_length - (TAG_LENGTH if config.auth else 0),
             "position_step": position_step(config.extent_m), "slot_ns": config.slot_ns, "seed": config.seed,

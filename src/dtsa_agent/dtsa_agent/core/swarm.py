@@ -81,6 +81,7 @@ class Swarm:
     sent_position: Annotated[Floats, "v3n"]  # m, last heard (own entry: last sent), quantised
     sent_velocity: Annotated[Floats, "v3n"]  # m/s
     sent_intent: Annotated[Floats, "v3n"]  # m/s, commanded velocity, zero where frames do not carry it
+    innovation: Annotated[Floats, "vn"]  # m/s, change of velocity in that state: sum over the axes
     sent_slot: Annotated[Slots, "vn"]  # slot of that state, -1: never heard
     last_turn: Annotated[Slots, "vn"]  # slot of the last turn; h = slot - 1 - last_turn
     in_ap: Annotated[Bytes, "vn"]  # A_p

@@ -83,6 +83,7 @@ static dtsa_agent *lay_out(arena *m, const dtsa_config *c)
     t.sent_p = part(m, 3 * n, sizeof(double));
     t.sent_v = part(m, 3 * n, sizeof(double));
     t.sent_c = part(m, 3 * n, sizeof(double));
+    t.innovation = part(m, n, sizeof(double));
     t.sent_slot = part(m, n, sizeof(int64_t));
     t.last = part(m, n, sizeof(int64_t));
     t.entry_hash = part(m, n, sizeof(uint32_t));
@@ -257,7 +258,7 @@ void agent_steer(dtsa_agent *a, int64_t slot, int step)
     if (c->avoid.margin_rate > 0.0) {
         const double dt = c->slot_s / c->steps;
         for (int k = 0; k < c->agents; k++)
-            t->ages[k] = t->sent_slot[k] < 0
+            t->ages[k] = t->sent_slot[k] < 0 || !t->in_ap[k] /* it rests where it was heard */
                              ? 0.0
                              : (double)(slot - t->sent_slot[k]) * c->slot_s + step * dt;
         ages = t->ages;

@@ -21,7 +21,9 @@ typedef struct dtsa_table {
     const dtsa_config *config;
     int observer; /* 0-based agent whose table it is, -1: one that hears everything */
     double *sent_p, *sent_v, *sent_c; /* (3, n) last heard state */
-    int64_t *sent_slot;               /* (n), -1: never */
+    double *innovation; /* (n) change of velocity in that state, against the one before: m/s, sum
+                           over the axes */
+    int64_t *sent_slot; /* (n), -1: never */
     int64_t
         *last; /* (n) slot in which it last took the agent for the sender; h = slot - 1 - last */
     uint8_t *in_ap;         /* (n) A_p */

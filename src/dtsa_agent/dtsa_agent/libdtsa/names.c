@@ -6,8 +6,9 @@
 #define NAME_COUNT(names) ((int)(sizeof(names) / sizeof *(names)))
 
 static const char *const POLICIES[] = {
-    [DTSA_POLICY_TDMA] = "tdma",   [DTSA_POLICY_DTSA] = "dtsa",   [DTSA_POLICY_AGE] = "age",
-    [DTSA_POLICY_ALOHA] = "aloha", [DTSA_POLICY_LEASE] = "lease",
+    [DTSA_POLICY_TDMA] = "tdma",   [DTSA_POLICY_DTSA] = "dtsa",
+    [DTSA_POLICY_AGE] = "age",     [DTSA_POLICY_ALOHA] = "aloha",
+    [DTSA_POLICY_LEASE] = "lease", [DTSA_POLICY_INNOVATION] = "innovation",
 };
 static_assert(NAME_COUNT(POLICIES) == DTSA_POLICY_EXTERNAL, "a policy without a name");
 
@@ -58,6 +59,7 @@ static const char *const REASONS[] = {
     [DTSA_REASON_LEASE_OPEN] = "open",
     [DTSA_REASON_LEASE_ABSENT] = "absent",
     [DTSA_REASON_LEASE_PROBATION] = "probation",
+    [DTSA_REASON_INNOVATION] = "innovation",
 };
 static_assert(NAME_COUNT(REASONS) == DTSA_REASON_COUNT, "a reason without a name");
 

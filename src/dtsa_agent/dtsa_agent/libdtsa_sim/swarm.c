@@ -29,6 +29,7 @@ static void open_table(swarm *s, int table)
         .sent_p = s->sent_position + plane,
         .sent_v = s->sent_velocity + plane,
         .sent_c = s->sent_intent + plane,
+        .innovation = s->innovation + at,
         .sent_slot = s->sent_slot + at,
         .last = s->last_turn + at,
         .in_ap = s->in_ap + at,

@@ -21,6 +21,7 @@ typedef struct swarm {
     int32_t *local;    /* (l) 0-based agent of each local slot */
     int32_t *observer; /* (v) 0-based agent of each table, -1: serves all */
     double *sent_position, *sent_velocity, *sent_intent; /* (v, 3, n) tables: see core.h */
+    double *innovation;                                  /* (v, n) */
     int64_t *sent_slot, *last_turn;                      /* (v, n) */
     uint8_t *in_ap;                                      /* (v, n) */
     uint32_t *entry_hash;                                /* (v, n) */

@@ -137,7 +137,7 @@ static void configure(dtsa_config *c)
                   .softness = 30.0,
                   .bias = 0.2,
                   .period = 0.2},
-        .lease = {5, 11, 1, 0.2, 1.0, 0, 15},
+        .lease = {policy == DTSA_POLICY_LEASE ? 3 : 5, 11, 1, 0.5, 1.0, 0, 15},
         .start = places,
         .target = places + 3 * n,
     };

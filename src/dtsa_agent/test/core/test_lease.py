@@ -76,7 +76,7 @@ def test_a_goodbye_frees_the_turns_at_once() -> None:
 def test_a_dead_agents_turns_are_adopted() -> None:
     air = Air(make(12, 12), loss=0.1).run(300)
     air.swarm.present[3] = 0
-    limit = 1000 + 2 * 5 * 12
+    limit = 1000 + 2 * 3 * 12
     air.run(limit + 60)
     turns = [slot for slot in range(300 + limit, 360 + limit) if slot % 12 == 3 and not is_anchor(slot, 12)]
     assert all(len(air.sent[slot]) == 1 for slot in turns)
@@ -205,7 +205,7 @@ def test_paper_frames_do_not_reach_an_extended_swarm_nor_the_other_way_round() -
 
 
 def test_the_chance_of_an_open_turn_halves_five_times_at_most() -> None:
-    rules = Rules(agents=12, slot_s=0.01, anchor_every=5, main_every=15)
+    rules = Rules(agents=12, slot_s=0.01, anchor_every=3, main_every=15)
     taken = {}
     for attempts in (4, 5, 6, 200):
         memory = Memory(rules, woke=0, attempts=attempts, probation=True)
@@ -219,19 +219,17 @@ def test_open_turns_visit_all_owners() -> None:
         period = SwarmConfig(agents=agents, moving=0, policy="lease").open_period
         assert period == max(11, agents // 5)
         for resting in {1, agents // 3, agents} - {0}:
-            kinds = ((0.0, 0), (0.0, resting), (1.0, 0), (1.0, resting))
-            blocks = [open_block(agents, period, wakers, resting, settled) for wakers, settled in kinds]
+            blocks = [open_block(agents, period, resting, settled) for settled in (0, resting)]
             assert all(np.gcd(block, agents) == 1 for block in blocks)
-            assert blocks[0] >= period * agents / resting
-            assert blocks[2] <= blocks[0] <= blocks[1]
+            assert period * agents / resting <= blocks[0] <= blocks[1]
     assert SwarmConfig(policy="lease", open_every=0).open_period == 0
-    assert open_block(12, 0, 0.0, 6, 6) == open_block(12, 11, 0.0, 0, 0) == 0
+    assert open_block(12, 0, 6, 6) == open_block(12, 11, 0, 0) == 0
 
 
 def test_open_turns_are_spaced_evenly() -> None:
     """So who wakes waits for one block at most, the odd one that is nobody's apart."""
     air = Air(make(40, 10, open_every=20)).run(3000)
-    block = open_block(40, 20, 0.0, 30, 30)
+    block = open_block(40, 20, 30, 30)
     opened = [slot for slot in range(3000, 3600) if air.run(1).swarm.reason_name(0) == "open"]
     assert len(opened) >= 0.9 * 600 / block
     assert max(np.diff(opened)) < 2 * block
@@ -283,9 +281,9 @@ def test_who_rests_is_thought_dead_later(rests: bool) -> None:
     air = Air(swarm).run(1200)
     quiet = 20 if rests else 2
     swarm.present[quiet - 1] = 0
-    air.run(1100)  # of 6 K N
+    air.run(900)  # of 1000, and of 6 K M N
     assert not swarm.lease_status(0)["absent"]
-    air.run(200)
+    air.run(400)
     assert bool(swarm.lease_status(0)["absent"]) is not rests
 
 
@@ -295,34 +293,6 @@ def test_turns_are_spread_evenly_over_those_that_move() -> None:
     assert max(each.max() for each in gaps) <= 12
     ages = [((each**2).sum() / each.sum() - 1.0) / 2.0 for each in gaps]
     assert 2.5 <= np.mean(ages) < 3.1  # (6 - 1) / 2 is the bound
-
-
-def test_movers_that_are_few_are_spaced_evenly() -> None:
-    """They give turns of their own away, too, but none waits for longer than a round; with losses they keep them."""
-    for agents, movers in ((12, 2), (12, 3), (18, 5)):
-        air = Air(make(agents, movers)).run(1800)
-        gaps = [np.diff([t for t in range(900, 1800) if air.sent[t] == (k,)]) for k in range(1, movers + 1)]
-        assert max(each.max() for each in gaps) <= agents
-        ages = [((each**2).sum() / each.sum() - 1.0) / 2.0 for each in gaps]
-        assert np.mean(ages) < (movers - 1) / 2 * 1.16 + 0.12  # (N_p - 1) / 2 is the bound; anchors, OPEN turns
-    given = [t for t in range(900, 1800) if t % 18 < 5 and air.sent[t] and air.sent[t] != (t % 18 + 1,)]
-    assert not any(is_anchor(t, 18) for t in given)
-    assert len(given) > 100
-    lossy = Air(make(18, 5), loss=0.1).run(1800).sent
-    assert sum(lossy[t] == (t % 18 + 1,) for t in range(900, 1800) if t % 18 < 5) > 0.95 * 250
-
-
-@pytest.mark.parametrize("loss", [0.0, 0.2])
-def test_who_arrives_says_so_for_three_rounds_where_frames_are_lost(loss: float) -> None:
-    """Who missed it would take it for a mover until its next main anchor."""
-    swarm = make(12, 6)
-    air = Air(swarm, loss).run(600)
-    swarm.goal[:, 2] = swarm.position[:, 2]
-    air.run(36)
-    own = [slot for slot in range(600, 636) if slot % 12 == 2]
-    assert [air.sent[slot] == (3,) for slot in own] == ([True] * 3 if loss else [True, False, False])
-    told = sum(any(air.frames[slot].leases) for slot in own if air.sent[slot] == (3,))
-    assert told == (0 if loss else 1)
 
 
 def test_who_knows_where_all_want_to_be_gives_turns_away_from_the_first_round_on() -> None:
@@ -366,14 +336,14 @@ def test_small_swarms_that_hear_late_relay_no_turn_that_nobody_gave_away(agents:
 
 
 @STATEMENTS
-def test_who_may_get_another_goal_keeps_its_turn_of_every_second_round(statement: Any) -> None:
+def test_an_agent_that_may_get_another_goal_keeps_its_anchors_only(statement: Any) -> None:
     swarm = make(12, 4, statement=statement)
     swarm.final[:] = 0
     air = Air(swarm).run(12 * 60)
-    for slot in range(12 * 40, 12 * 60):
-        if slot % 12 >= 4 and (slot // 12 + slot % 12) % 2 == 0:
-            assert air.sent[slot] == (slot % 12 + 1,)
-    assert air.leases(12 * 40, 12 * 60) > 0  # its other turns are given away
+    hovering = [slot for slot in range(12 * 40, 12 * 60) if slot % 12 >= 4]
+    assert [slot for slot in hovering if air.sent[slot] == (slot % 12 + 1,)] == [
+        slot for slot in hovering if is_anchor(slot, 12)
+    ]
 
 
 def flight(**settings: Any) -> Air:
@@ -394,10 +364,3 @@ def test_nobody_sets_out_unheard(seed: int) -> None:
             flown.add(int(k))
     assert len(flown) >= 14
     assert any(len(senders) > 1 for senders in air.sent)
-
-
-def test_movers_keep_their_turns_in_the_first_round() -> None:
-    # Who waits for its start is taken for settled then, but gives nothing away.
-    air = flight(avoider="jerky", seed=5101).run(120)
-    turns = [slot for slot, senders in enumerate(air.sent) if air.sent[0][0] in senders]
-    assert max(np.diff(turns)) <= 24

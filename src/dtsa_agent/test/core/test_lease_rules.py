@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from lease_helpers import FAR, STATEMENTS, Air, is_anchor, make
 
-from dtsa_agent.core.frame import ExtendedFrame
+from dtsa_agent.core.frame import ExtendedFrame, Frame, encode_extended
 
 MAIN = 15  # K M of the default settings
+NOTHING = ExtendedFrame(Frame(1, 0, 0, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3))
 
 
 def fly(statement: Any, agents: int, movers: int, **settings: Any) -> Air:
@@ -149,9 +150,72 @@ def test_an_own_entry_holds_nothing_that_was_sent_in_an_open_turn_unheard(statem
 
 @STATEMENTS
 def test_a_relay_leaves_out_own_turns_that_the_same_frame_names(statement: Any) -> None:
-    flight = fly(statement, 12, 3).run(600)
+    flight = fly(statement, 12, 3).run(800)
     naming = {slot: frame for slot, frame in flight.frames.items() if any(frame.leases)}
     assert len(naming) > 50
     for slot, frame in naming.items():
         turns = [slot + ahead for ahead, _ in frame.relay]
         assert not [turn for turn in turns if turn % 12 == frame.own.sender - 1]
+
+
+@STATEMENTS
+def test_an_agent_that_has_just_turned_is_heard_again_soon(statement: Any) -> None:
+    """By the turns of others: its waits are shorter than theirs while its velocity changes from frame to frame."""
+    flight = fly(statement, 18, 6).run(200)
+    sent: list[tuple[int, ...]] = []
+    for slot in range(300):
+        flight.swarm.velocity[0, 2] = 0.5 if slot // 5 % 2 else -0.5  # agent 3
+        sent += flight.run(1).sent[-1:]
+    assert sent.count((3,)) > 1.2 * max(sent.count((agent,)) for agent in (1, 2, 4, 5, 6))
+    assert min(sent.count((agent,)) for agent in (1, 2, 4, 5, 6)) >= 300 / 18  # nobody waits for longer than a round
+
+
+@STATEMENTS
+def test_a_turn_comes_back_to_the_agent_that_handed_it_on(statement: Any) -> None:
+    """Two that turn one after the other hand a turn to and fro, and its last lessee sends in it."""
+    flight = fly(statement, 18, 3).run(200)
+    back = 0
+    lessees: dict[int, list[int]] = {}  # of each turn, as its lessees said
+    for slot in range(flight.slot, flight.slot + 300):
+        flight.swarm.velocity[0, :3] = 0.3 * np.random.default_rng([slot // 4, 3]).normal(size=3)
+        flight.run(1)
+        frame = flight.frames.get(slot)
+        for ahead, lessee in frame.relay if frame is not None else ():
+            chain = lessees.setdefault(slot + ahead, [])
+            if not chain or (frame is not None and chain[-1] == frame.own.sender != lessee):
+                chain.append(lessee)
+        chain = lessees.pop(slot, [])
+        back += len(set(chain)) < len(chain)
+        assert not chain or chain[-1] == 255 or flight.sent[slot] == (chain[-1],)
+    assert back > 5
+
+
+@STATEMENTS
+def test_a_frame_older_than_the_own_last_one_brings_no_turn_back(statement: Any) -> None:
+    """Agent 1 hands a turn on to 2; a frame of 2 that was sent before it heard that still says it is agent 1's."""
+    flight = fly(statement, 18, 3).run(400)
+    while True:  # until a mover hands a turn on to another one
+        before = dict(flight.frames.get(flight.slot - 1, NOTHING).relay)
+        frame = flight.run(1).frames.get(flight.slot - 1)
+        flight.swarm.velocity[0, 1] = 0.5 if flight.slot // 4 % 2 else -0.5
+        handed = [
+            (flight.slot - 1 + ahead, lessee)
+            for ahead, lessee in (frame.relay if frame else ())
+            if before.get(ahead + 1) == frame.own.sender != lessee <= 3 and ahead > 4
+        ]
+        if handed:
+            break
+        assert flight.slot < 1400
+    assert frame is not None
+    turn, heir = handed[0]
+    sender, slot = frame.own.sender, flight.slot  # the one after the frame
+    stale = replace(frame, own=replace(frame.own, sender=heir, slot=slot - 1), relay=((turn - slot + 1, sender),))
+    swarm = flight.swarm
+    swarm.begin(slot)
+    assert swarm.hear(slot, encode_extended(replace(stale, leases=b"", far=(), far_lessee=0)))
+    swarm.end(slot)
+    flight.slot += 1
+    flight.sent.append(())
+    flight.chosen.append([])
+    flight.run(turn - flight.slot + 1)
+    assert flight.chosen[turn][sender - 1] != sender

@@ -81,7 +81,14 @@ def test_an_agent_does_not_start_where_it_cannot() -> None:
     assert lib.dtsa_agent_start(block, size, config, 6)
     for place, room, agent in ((block, size - 8, 1), (odd, size, 1), (block, size, 0), (block, size, 7), (0, size, 1)):
         assert not lib.dtsa_agent_start(ffi.cast("void *", place), room, config, agent)
-    for field, value in (("agents", 0), ("agents", 255), ("policy", 6), ("profile", 0), ("c_r", 0), ("slot_s", 0.0)):
+    for field, value in (
+        ("agents", 0),
+        ("agents", 255),
+        ("policy", lib.DTSA_POLICY_EXTERNAL + 1),
+        ("profile", 0),
+        ("c_r", 0),
+        ("slot_s", 0.0),
+    ):
         bad = ffi.new("dtsa_config *", config[0])
         setattr(bad, field, value)
         assert ffi.string(lib.dtsa_config_fault(bad)).decode() == field

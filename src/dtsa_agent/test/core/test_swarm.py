@@ -13,7 +13,7 @@ from slot_helpers import one_slot
 from dtsa_agent.core import REASONS, ConfigError, Swarm, SwarmConfig, encode_frame
 from dtsa_agent.core.frame import Frame
 
-COLLISION_FREE = ("tdma", "dtsa", "age")
+COLLISION_FREE = ("tdma", "dtsa", "age", "innovation")
 
 
 def fly(slots: int, **settings: Any) -> tuple[Swarm, list[list[int]]]:
@@ -48,6 +48,18 @@ def test_age_is_round_robin_over_a_p() -> None:
     movers = sorted(int(k) + 1 for k in np.flatnonzero(swarm.scenario.moving))
     assert sorted(s[0] for s in senders[:6]) == [1, 2, 3, 4, 5, 6]
     assert senders[10:20] in ([[movers[0]], [movers[1]]] * 5, [[movers[1]], [movers[0]]] * 5)
+
+
+def test_innovation_hears_an_agent_that_turns_more_often_than_one_that_flies_straight() -> None:
+    swarm = Swarm(SwarmConfig(agents=6, moving=6, policy="innovation", avoider="none", axis_x_m=50.0))
+    senders = []
+    for slot in range(300):
+        swarm.velocity[:] = 1.0
+        swarm.velocity[0, 2] = 1.5 if slot // 7 % 2 else 0.5  # agent 3
+        senders += one_slot(swarm, slot)
+    heard = [senders[20:].count(agent) for agent in range(1, 7)]
+    assert heard[2] > 1.5 * max(heard[:2] + heard[3:])
+    assert min(heard) > 5
 
 
 def test_without_boot_round_and_age_cap_the_literal_text_starves() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import RemoteProtocolError
@@ -26,6 +26,20 @@ def is_anchor(slot: int, agents: int, every: int) -> bool:
 
 
 @dataclass(slots=True)
+class HandedTurn:
+    """Agents that a turn was given to."""
+
+    holders: set[int] = field(default_factory=set)  # named last, one for each that gave it away
+    named: set[int] = field(default_factory=set)  # ever
+    handed_on: dict[int, int] = field(default_factory=dict)  # slot in which an agent first handed it on
+
+    def name(self, lessee: int) -> None:
+        """Note that a frame names an agent for the turn."""
+        self.holders.add(lessee)
+        self.named.add(lessee)
+
+
+@dataclass(slots=True)
 class Ledger:
     """Who gave which turn to whom, and whether all kept to it.
 
@@ -36,7 +50,7 @@ class Ledger:
     anchor_every: int
     main_every: int = 0
     issued: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # turn -> (issuer, lessee)
-    handed: dict[int, dict[int, tuple[int, int]]] = field(default_factory=dict)  # turn -> lessee -> (next one, slot)
+    handed: dict[int, HandedTurn] = field(default_factory=dict)  # by turn
     quiet: dict[int, int] = field(default_factory=dict)  # last slot in which each was in probation
     open_collisions: int = 0  # slots with two senders that had been given to all who wake
     adopted_collisions: int = 0  # slots with two senders, given away by somebody other than their owner
@@ -45,6 +59,8 @@ class Ledger:
     plain_collisions: int = 0  # any other slot with two senders
     leased_slots: int = 0
     broken: list[str] = field(default_factory=list)  # rules that were broken, in words
+
+    _NEVER: ClassVar[int] = 2**62  # slot
 
     def _is_anchor(self, slot: int) -> bool:
         """Whether nobody but its owner may give a slot away."""
@@ -71,7 +87,7 @@ class Ledger:
 
     def slot(self, slot: int, frames: dict[int, bytes]) -> None:
         """Takes in one slot."""
-        given, handed = self.issued.pop(slot, []), self.handed.pop(slot, {})
+        given, handed = self.issued.pop(slot, []), self.handed.pop(slot, HandedTurn())
         owner = slot % self.agents + 1
         is_open = any(lessee == OPEN for _, lessee in given)
         adopted = any(issuer != owner for issuer, _ in given)
@@ -85,7 +101,7 @@ class Ledger:
             self.handed_collisions += forgotten and not taken_back
             if not (is_open or adopted or taken_back or forgotten):
                 self.plain_collisions += 1
-                self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}, handed on {handed}")
+                self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}, by now to {handed.holders}")
         for sender, data in frames.items():
             self._check_sender(slot, sender, owner, given, data, handed)
             self.read(slot, sender, data)
@@ -96,20 +112,14 @@ class Ledger:
             return False
         return decode_extended(data).probation
 
-    def _forgotten(self, handed: dict[int, tuple[int, int]], sender: int) -> bool:
-        """Whether a sender handed the turn on before it began anew: what others relay may be all that it knows."""
-        return sender in handed and self.quiet.get(sender, -1) > handed[sender][1]
+    def _forgotten(self, handed: HandedTurn, sender: int) -> bool:
+        """Whether a sender handed the turn on before it restarted: what others relay may be all that it knows."""
+        return self.quiet.get(sender, -1) > handed.handed_on.get(sender, self._NEVER)
 
     def _check_sender(
-        self,
-        slot: int,
-        sender: int,
-        owner: int,
-        given: list[tuple[int, int]],
-        data: bytes,
-        handed: dict[int, tuple[int, int]],
+        self, slot: int, sender: int, owner: int, given: list[tuple[int, int]], data: bytes, handed: HandedTurn
     ) -> None:
-        last = {last_lessee(handed, lessee) for _, lessee in given}
+        last = handed.holders
         if sender in last or OPEN in last or self._forgotten(handed, sender):
             return
         if sender != owner:
@@ -137,40 +147,33 @@ class Ledger:
             owner = turn % self.agents + 1
             if self._is_main(turn) or turn <= slot:
                 self.broken.append(f"slot {slot}: agent {sender} gives away turn {turn}")
-            entries, handed = self.issued.setdefault(turn, []), self.handed.get(turn, {})
-            if any(issuer == sender and lessee in lessees(handed, first) for issuer, first in entries):
+            entries, handed = self.issued.setdefault(turn, []), self.handed.setdefault(turn, HandedTurn())
+            if lessee in handed.named and any(issuer == sender for issuer, _ in entries):
                 continue  # said again
             if sender == owner and any(issuer == owner for issuer, _ in entries):
                 self.broken.append(f"slot {slot}: agent {sender} gives turn {turn} away a second time")
-            if (sender, lessee) not in entries:
-                entries.append((sender, lessee))
+            entries.append((sender, lessee))
+            handed.name(lessee)
         for ahead, lessee in (*frame.relay, *((far, frame.far_lessee) for far in frame.far)):
             self._hand_on(slot, sender, slot + ahead, lessee)
 
     def _hand_on(self, slot: int, sender: int, turn: int, lessee: int) -> None:
-        """Whose turn it is names another one for it; everybody else only relays."""
-        chain = self.handed.get(turn, {})
-        given = [first for _, first in self.issued.get(turn, [])]
-        before = {sender, *given, *chain}  # who was given it and does not know it yet, relays one of these
-        if lessee in before or all(last_lessee(chain, first) != sender for first in given):
+        """Whose turn it is names another agent for it; everybody else only relays.
+
+        An agent that does not know yet that it was named relays an earlier holder. That one takes the turn again, so it
+        counts as handing on.
+        """
+        handed = self.handed.get(turn)
+        if handed is None or sender not in handed.holders or lessee in handed.holders:
             return
         if lessee in (OPEN, turn % self.agents + 1) or self._is_main(turn):
+            if lessee in handed.named:  # a relay of another one that gave it away
+                return
             self.broken.append(f"slot {slot}: agent {sender} hands turn {turn} on to {lessee}")
-        elif sender not in chain:
-            self.handed.setdefault(turn, {})[sender] = (lessee, slot)
-
-
-def last_lessee(handed: dict[int, tuple[int, int]], lessee: int) -> int:
-    """Whose turn it is after it has been handed on, each agent once."""
-    return lessees(handed, lessee)[-1]
-
-
-def lessees(handed: dict[int, tuple[int, int]], first: int) -> list[int]:
-    """Whose a turn was, one after the other."""
-    chain = [first]
-    while chain[-1] in handed and len(chain) <= len(handed):
-        chain.append(handed[chain[-1]][0])
-    return chain
+            return
+        handed.holders.remove(sender)
+        handed.name(lessee)
+        handed.handed_on.setdefault(sender, slot)
 
 
 class Judge:

@@ -76,6 +76,11 @@ class LiveFlight:
                 raise ConfigError("kind", fault.kind, ", ".join(FAULTS))
 
     @property
+    def anchor_every(self) -> int:
+        """Rounds within which each agent sends, if it moves."""
+        return 3 if self.policy == "lease" else 5
+
+    @property
     def main_every(self) -> int:
         """Rounds within which each agent sends, if it rests."""
         return 15 if self.policy == "lease" else 5
@@ -145,12 +150,14 @@ def _c_flight(flight: LiveFlight) -> tuple[Any, list[Any]]:
         "estimator": lib.DTSA_ESTIMATE_LINEAR, "avoider": lib.DTSA_AVOID_NONE, "r_min": 0.3, "targets_known": 1,
         "gossip": 1, "avoid": {"v_max": 1.0, "gain": 2.0}, "start": start, "target": away,
         "lease": {
-            "anchor_every": 5, "main_every": 15, "open_every": 11, "adoption": 1, "depth_rate": 0.2, "share": 1.0,
+            "anchor_every": flight.anchor_every, "main_every": 15, "open_every": 11, "adoption": 1, "depth_rate": 0.5,
+            "share": 1.0,
         },
     })  # fmt: skip
     station = {
-        "agents": n, "anchor_every": 5, "main_every": flight.main_every, "slot_cycle": lib.dtsa_slot_cycle(config),
-        "extended": lease, "frame_length": 56 if lease else 19, "position_step": 0.002, "slot_ns": flight.slot_ns,
+        "agents": n, "anchor_every": flight.anchor_every, "main_every": flight.main_every,
+        "slot_cycle": lib.dtsa_slot_cycle(config), "extended": lease,
+        "frame_length": 56 if lease else 19, "position_step": 0.002, "slot_ns": flight.slot_ns,
         "seed": draw.randrange(1000), "quorum": lib.DTSA_QUORUM_ALL_BUT_ONE, "early_count": 64,
         "key": key if flight.signed else ffi.NULL, "key_length": 16, "session": 77,
         "link": {

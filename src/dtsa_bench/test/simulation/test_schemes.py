@@ -46,7 +46,7 @@ def steady(policy: str, agents: int, movers: int, loss: float = 0.0, slots: int 
 def test_without_loss_the_genie_reaches_the_bound_and_nobody_gets_below_it() -> None:
     """(N_p - 1) / 2: round robin over the movers."""
     assert steady("genie-age", 12, 6).outcome.age == pytest.approx(2.5)
-    for policy in ("tdma", "lease", "genie-error", "dtsa"):
+    for policy in ("tdma", "lease", "genie-error", "genie-innovation", "dtsa"):
         assert steady(policy, 12, 6).outcome.age > 2.5 - 1e-9
 
 

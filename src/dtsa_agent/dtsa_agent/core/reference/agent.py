@@ -82,7 +82,8 @@ class Agent:
             return encode(own, rules.position_step)
         said = Said()
         if rules.policy == "lease":
-            said = say(self.memory, self.index, self.table, slot, self.final, self.present == LEAVES)
+            leaves = self.present == LEAVES
+            said = say(self.memory, self.index, self.table, slot, self.velocity, self.final, leaves)
         used = -(-len(said.leases) // SECTION_BYTES) + bool(said.relay) + bool(said.far)
         carried = gossip.collect(self.table, self.index, slot, SECTIONS - used, rules) if rules.gossip else ()
         frame = ExtendedFrame(

@@ -54,6 +54,11 @@ def norm(a: Vector) -> float:
     return math.sqrt(dot(a, a))
 
 
+def norm1(a: Vector) -> float:
+    """The sum of the absolute values, from the left."""
+    return abs(a[0]) + abs(a[1]) + abs(a[2])
+
+
 def sum_in_lanes(values: Sequence[float]) -> float:
     """The sum of some numbers, in the one order that all agents use.
 

@@ -1,4 +1,4 @@
-"""Who sends in a slot: policies that decide from the table alone, ``tdma``, ``dtsa``, ``age`` and ``aloha``."""
+"""Who sends in a slot: policies that decide from the table alone: all but ``lease``."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ class Choice:
 
 
 NOBODY = Choice(-1, "nobody")
+STRAIGHT = 0.02  # m/s, weight of an agent that flies straight on, with policy innovation
 
 
 @dataclass(slots=True)
@@ -56,6 +57,8 @@ def choose(table: Table, slot: int, rules: Rules, weights: Weights | None = None
         return Choice(longest, "oldest")
     if rules.age_cap > 0.0 and h[longest] >= rules.age_cap * len(members):
         return Choice(longest, "age-cap")
+    if rules.policy == "innovation":
+        return Choice(max(members, key=lambda k: h[k] * (STRAIGHT + table.rows[k].innovation)), "innovation")
     return choose_by_priority(table, slot, rules, weights)
 
 

@@ -34,11 +34,11 @@ class Rules:
     gossip: bool = True
     key: int = 0  # of the draws
     # lease
-    anchor_every: int = 5  # M
-    main_every: int = 5  # K M
+    anchor_every: int = 3  # M
+    main_every: int = 3  # K M
     open_every: int = 11  # S; 0: none
     adoption: bool = True
-    depth_rate: float = 0.2  # c
+    depth_rate: float = 0.5  # c
     lease_share: float = 1.0
 
     @property

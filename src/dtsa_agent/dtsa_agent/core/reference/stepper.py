@@ -51,7 +51,9 @@ class ReferenceSwarm(Swarm):
         super().__init__(config, scenario, local)
         self.rules = rules_of(config, self.scenario)
         start = _vectors(self.scenario.start)
-        self.agents = [Agent(int(k), self.rules, Table(int(k) + 1, start)) for k in self.local]
+        by_innovation = config.policy == "innovation"
+        tables = [Table(int(k) + 1, start, by_innovation=by_innovation) for k in self.local]
+        self.agents = [Agent(table.observer - 1, self.rules, table) for table in tables]
         for place in range(len(self.agents)):
             self._publish(place)
 
@@ -158,6 +160,7 @@ class ReferenceSwarm(Swarm):
         table = self.agents[place].table
         for name in ("position", "velocity", "intent"):
             getattr(self, f"sent_{name}")[place] = np.array([getattr(row, name) for row in table.rows]).T
+        self.innovation[place] = [row.innovation for row in table.rows]
         self.sent_slot[place] = [row.sent_slot for row in table.rows]
         self.last_turn[place] = [row.last_turn for row in table.rows]
         self.in_ap[place] = [row.in_ap for row in table.rows]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from dtsa_agent.core.frame import Frame
 
-from .arithmetic import ZERO, Vector, bits_of, mix64
+from .arithmetic import ZERO, Vector, bits_of, minus, mix64, norm1
 
 
 @dataclass(slots=True)
@@ -17,6 +17,7 @@ class Row:
     position: Vector  # m, frame map
     velocity: Vector = ZERO  # m/s
     intent: Vector = ZERO  # m/s, commanded velocity, zero where frames do not carry it
+    innovation: float = 0.0  # m/s, change of velocity in that state against the one before: sum over the axes
     sent_slot: int = -1  # m in eq:estimate: slot of that state, -1: never heard
     last_turn: int = -1  # slot of its last turn
     in_ap: bool = True  # it is a member of A_p: it has something to say
@@ -32,11 +33,13 @@ class Table:
     """What one observer knows.
 
     :param known_goals: where those that rest are taken to stand, m; None: nobody knows that.
+    :param by_innovation: decisions depend on the innovation, too, so digests do.
     """
 
     observer: int
     start: Sequence[Vector]
     known_goals: Sequence[Vector] | None = None
+    by_innovation: bool = False
     rows: list[Row] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -55,7 +58,8 @@ class Table:
         """
         row, rests = self.rows[frame.sender - 1], frame.c_r == 0
         row.position = self.known_goals[frame.sender - 1] if rests and self.known_goals is not None else frame.position
-        row.velocity = ZERO if rests else frame.velocity
+        velocity = ZERO if rests else frame.velocity
+        row.innovation, row.velocity = norm1(minus(velocity, row.velocity)), velocity
         row.intent = ZERO if rests or frame.intent is None else frame.intent
         row.sent_slot = sampled
         row.in_ap = not rests
@@ -86,4 +90,6 @@ class Table:
         for axis in range(3):
             x = mix64(x ^ bits_of(row.position[axis]))
             x = mix64(x ^ bits_of(row.velocity[axis]))
+        if self.by_innovation:
+            x = mix64(x ^ bits_of(row.innovation))
         row.digest = (x ^ x >> 32) & 0xFFFFFFFF

@@ -99,13 +99,13 @@ class SwarmConfig(Settings):
     )
     gossip: bool = setting(True, "extended frames carry what their sender last heard of others")
     anchor_every: int = setting(
-        5,
+        3,
         "lease: every so many rounds an agent's turn is an anchor: nobody else gives it away, M",
         minimum=1,
         maximum=MOST_ROUNDS,
     )
     anchor_rest: int = setting(
-        3,
+        5,
         "lease: an agent that knows that it will rest gives all but one of so many anchors away, K; K M is at most 15, "
         "M without open turns or adoption",
         minimum=1,
@@ -118,7 +118,7 @@ class SwarmConfig(Settings):
         maximum=1000,
     )
     adoption: bool = setting(True, "lease: the turns of the dead are given away by the next agent alive")
-    depth_rate: float = setting(0.2, "lease: turns given away ahead, per round of idleness, c", minimum=0, maximum=15)
+    depth_rate: float = setting(0.5, "lease: turns given away ahead, per round of idleness, c", minimum=0, maximum=15)
     lease_share: float = setting(
         1.0, "lease: no leases when more than this share of the agents has something to say", minimum=0, maximum=1
     )
@@ -261,6 +261,11 @@ class SwarmConfig(Settings):
     def open_period(self) -> int:
         """S: one of so many turns of those that rest is open to all who wake, at least N / 5; 0: none is."""
         return max(self.open_every, self.agents // 5) if self.open_every else 0
+
+    @property
+    def heard_every(self) -> int:
+        """Rounds within which each agent that moves sends: M; 5 with policies that have no anchors."""
+        return self.anchor_every if self.policy_row.probation else 5
 
     @property
     def main_every(self) -> int:

@@ -34,7 +34,7 @@
 extern "C" {
 #endif
 
-#define DTSA_VERSION 101
+#define DTSA_VERSION 200
 
 #if defined(__GNUC__)
 #define DTSA_API __attribute__((visibility("default")))
@@ -60,6 +60,7 @@ enum {
     DTSA_POLICY_AGE,
     DTSA_POLICY_ALOHA,
     DTSA_POLICY_LEASE,
+    DTSA_POLICY_INNOVATION,
     DTSA_POLICY_EXTERNAL /* somebody else decides */
 };
 enum {
@@ -93,6 +94,7 @@ enum {
     DTSA_REASON_LEASE_OPEN,      /* given to whoever has just woken or joined */
     DTSA_REASON_LEASE_ABSENT,    /* its owner is thought dead */
     DTSA_REASON_LEASE_PROBATION, /* its owner may not use it yet */
+    DTSA_REASON_INNOVATION, /* policy innovation: largest counter h, weighed by the change of velocity */
     DTSA_REASON_COUNT
 };
 

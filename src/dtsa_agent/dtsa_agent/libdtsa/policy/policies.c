@@ -13,9 +13,10 @@ static const policy_row policy_external = {
     .name = "external", .decide = decide_nothing, .end = end_counters};
 
 static const policy_row *const POLICIES[] = {
-    [DTSA_POLICY_TDMA] = &policy_tdma,   [DTSA_POLICY_DTSA] = &policy_dtsa,
-    [DTSA_POLICY_AGE] = &policy_age,     [DTSA_POLICY_ALOHA] = &policy_aloha,
-    [DTSA_POLICY_LEASE] = &policy_lease, [DTSA_POLICY_EXTERNAL] = &policy_external,
+    [DTSA_POLICY_TDMA] = &policy_tdma,         [DTSA_POLICY_DTSA] = &policy_dtsa,
+    [DTSA_POLICY_AGE] = &policy_age,           [DTSA_POLICY_ALOHA] = &policy_aloha,
+    [DTSA_POLICY_LEASE] = &policy_lease,       [DTSA_POLICY_INNOVATION] = &policy_innovation,
+    [DTSA_POLICY_EXTERNAL] = &policy_external,
 };
 
 const policy_row *policy_of(int number)

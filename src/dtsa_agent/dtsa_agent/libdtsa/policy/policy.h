@@ -25,7 +25,8 @@ struct policy_row {
     int needs_extended, says_leaving;
 };
 
-extern const policy_row policy_tdma, policy_dtsa, policy_age, policy_aloha, policy_lease;
+extern const policy_row policy_tdma, policy_dtsa, policy_age, policy_aloha, policy_lease,
+    policy_innovation;
 const policy_row *policy_of(int number); /* NULL: there is none */
 
 /* common.c: what several policies do */

@@ -9,7 +9,7 @@ Each is announced by entry point in the group ``dtsa.policies``, so ``--policy g
 from .contention import Dominance, ThresholdAloha
 from .dtr import Dtr
 from .event_tdma import EventTdma
-from .genie import GenieAge, GenieError, Whittle
+from .genie import GenieAge, GenieError, GenieInnovation, Whittle
 from .mixer import Mixer
 from .sense import Sense
 from .sotdma import Sotdma
@@ -17,6 +17,6 @@ from .threshold_aoii import ThresholdAoii
 from .unslotted import Beacons, Csma, PureAloha
 
 __all__ = [
-    "Beacons", "Csma", "Dominance", "Dtr", "EventTdma", "GenieAge", "GenieError", "Mixer", "PureAloha",
-    "Sense", "Sotdma", "ThresholdAloha", "ThresholdAoii", "Whittle",
+    "Beacons", "Csma", "Dominance", "Dtr", "EventTdma", "GenieAge", "GenieError", "GenieInnovation", "Mixer",
+    "PureAloha", "Sense", "Sotdma", "ThresholdAloha", "ThresholdAoii", "Whittle",
 ]  # fmt: skip

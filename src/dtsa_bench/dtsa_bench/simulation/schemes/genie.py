@@ -26,6 +26,29 @@ class GenieAge:
         return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
 
 
+class GenieInnovation:
+    """:class:`GenieAge`, where the ages of an agent are weighed by the change of velocity in its last frame.
+
+    An agent that brakes or swerves has sent a velocity that it will not keep, so it is heard again soon. The setting
+    ``age_cap`` counts as with ``dtsa``: an agent whose mean age is so many times the number of movers goes first.
+    """
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del agent
+        self._cap = config.age_cap
+
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
+        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        pairs = counts(swarm)
+        age = np.where(pairs, ages(swarm, slot), 0.0).sum(axis=0)
+        mean = age / np.maximum(pairs.sum(axis=0), 1)
+        if self._cap and mean.max() >= self._cap * np.count_nonzero(moves(swarm)) > 0:
+            return [int(mean.argmax()) + 1]
+        weight = age * (0.02 + np.diagonal(swarm.innovation))
+        best = int(weight.argmax())
+        return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
+
+
 class Whittle:
     """The agent with the largest sum of Whittle's indices of the true ages at all receivers.
 

@@ -5,19 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from dtsa_agent.core.reference.arithmetic import minus, norm
+from dtsa_agent.core.reference.arithmetic import Vector, minus, norm, norm1
 from dtsa_agent.core.reference.frame_extended import FAR_REACH, LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH, SECTION_BYTES
 from dtsa_agent.core.reference.table import Table
 
-from .memory import HANDED, MISSED, ROUNDS, Lease, Memory
+from .memory import HANDED, MISSED, Lease, Memory
 
-FEW = 0.5  # more missed frames than this in 8 N slots: movers keep their turns
-MORE = 2  # a mover hands on turns that are worth so many times as much to somebody else
-MANY = 0.1  # share of frames
-MUCH_MORE = 3  # ... where many are lost, so that some of those named do not learn of it
-KEPT_EVERY = 2  # who may get another goal keeps its turn of every so many rounds
-ROUNDS_TOLD = 3  # who has arrived says so for so many rounds, where frames are lost
-OFTEN = 2.0  # at least so many OPEN turns for each that wakes
+NEED, MOST_NEED = 50.0, 6000.0  # NEED: s/m
+MORE = 2  # a mover hands on turns that are worth so many times as much to another agent
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +37,8 @@ class Electorate:
     settled: list[bool]  # of these, who knows that it will rest
     block: int  # one turn in so many is OPEN; 0: none
     informed: bool  # all have spoken, or all know where all want to be
-    lends: bool  # movers give turns away, too: most rest, all of them settled, and no frames are lost
     last: list[int]  # slot in which each sent last, or is foreseen to send
+    need: list[int]  # weight of each: more the more its velocity has just changed
     rights: list[list[int]] = field(default_factory=list)  # slots to come in which each is known to send
 
     @property
@@ -52,16 +47,20 @@ class Electorate:
         return sum(self.able)
 
 
-def say(memory: Memory, self_index: int, table: Table, slot: int, final: bool, leaves: bool) -> Said:
-    """What the agent's frame says about turns; the turns that it gives away are noted."""
+def say(memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leaves: bool) -> Said:
+    """What the agent's frame says about turns; the turns that it gives away are noted.
+
+    :param velocity: of the agent, m/s.
+    """
     own_turn = memory.owner(slot) == self_index
+    memory.spoke = slot
     leaving = memory.leaving = own_turn and leaves
     claims = memory.rules.adoption and not memory.probation and not leaving
     c_s = count_absent_before(memory, self_index, slot) if claims else 0
     leases = b""
     if own_turn:
-        leases = issue(memory, self_index, table, slot, c_s, 0 if leaving else None, final)
-    handed = hand_on(memory, self_index, table, slot, final, leases)
+        leases = issue(memory, self_index, table, slot, velocity, c_s, 0 if leaving else None, final)
+    handed = hand_on(memory, self_index, table, slot, velocity, final, leases)
     near = [turn for turn in handed if turn - slot <= RELAY_REACH]
     far = tuple(turn - slot for turn in handed if turn - slot > RELAY_REACH)
     lessee = memory.leases[handed[-1]].lessee if far else 0
@@ -76,7 +75,7 @@ def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
     return count
 
 
-def electorate(memory: Memory, self_index: int, table: Table, slot: int, final: bool) -> Electorate:
+def electorate(memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool) -> Electorate:
     """Who may be given a turn, and who else there is."""
     rows, agents = table.rows, range(memory.rules.agents)
     presumed = [is_presumed(memory, table, k, slot) for k in agents]
@@ -89,18 +88,29 @@ def electorate(memory: Memory, self_index: int, table: Table, slot: int, final: 
     settled = [rests[k] and (presumed[k] or memory.settled[k]) for k in agents]
     settled[self_index] = rests[self_index] and final
     informed = slot >= memory.rules.agents or table.known_goals is not None
-    few_move = sum(rests) == sum(settled) > 0 and 3 * sum(able) < memory.rules.agents
-    # In the first round those that wait for a goal are taken for settled, and give a mover nothing.
-    lends = slot >= memory.rules.agents and few_move and memory.lost < FEW
     last = [row.sent_slot if row.sent_slot >= 0 else slot - memory.rules.agents for row in rows]
-    block = open_block(memory.rules.agents, memory.rules.open_every, memory.wakers, sum(rests), sum(settled))
-    return Electorate(sum(alive), able, rests, settled, block, informed, lends, last)
+    block = open_block(memory.rules.agents, memory.rules.open_every, sum(rests), sum(settled))
+    innovation = [row.innovation for row in rows]
+    innovation[self_index] = norm1(minus(velocity, rows[self_index].velocity))  # of the frame that is being made
+    return Electorate(
+        sum(alive), able, rests, settled, block, informed, last, [need_of(change) for change in innovation]
+    )
+
+
+def need_of(innovation: float) -> int:
+    """How much the wait of an agent counts: 1, and 1 more for each 2 cm/s by which its velocity has just changed.
+
+    It has just turned, and others extrapolate a velocity that it may not keep.
+    """
+    more = NEED * innovation
+    return 1 + int(more if more < MOST_NEED else MOST_NEED)
 
 
 def is_presumed(memory: Memory, table: Table, k: int, slot: int) -> bool:
     """Whether nothing is known of an agent but where it starts and wants to be: in the first round."""
     first_round = memory.born == 0 and slot < memory.rules.agents
-    return first_round and table.known_goals is not None and table.rows[k].sent_slot < 0
+    unheard = table.rows[k].sent_slot < 0 and not memory.absent(k, slot)
+    return first_round and table.known_goals is not None and unheard
 
 
 def sets_out(memory: Memory, table: Table, k: int) -> bool:
@@ -109,15 +119,14 @@ def sets_out(memory: Memory, table: Table, k: int) -> bool:
     return norm(minus(table.known_goals[k], table.start[k])) > memory.rules.r_min
 
 
-def open_block(agents: int, every: int, wakers: float, resting: int, settled: int) -> int:
-    """Slots of which one turn goes to those who wake; 0: none.
+def open_block(agents: int, every: int, resting: int, settled: int) -> int:
+    """Slots of which one turn goes to agents that wake: S turns of those that rest lie in so many; 0: none.
 
-    S turns of those that rest lie in so many; half as many more where all of them are settled; fewer while many wake,
-    so that each of them finds two. It has no factor in common with N, or the same few owners would always pay.
+    Half as many more where all of them are settled. It has no factor in common with N, or the same few owners would
+    always pay.
 
     :param agents: N, number of agents.
     :param every: S, number of turns of those that rest of which one is an OPEN turn.
-    :param wakers: w, about as many agents as woke in the last N slots.
     :param resting: number of those that rest.
     :param settled: number of those of them that know that they will rest.
     """
@@ -126,32 +135,21 @@ def open_block(agents: int, every: int, wakers: float, resting: int, settled: in
     block = -(-every * agents // resting)  # rounded up
     if settled == resting:
         block += block // 2
-    if block * OFTEN * wakers > agents:
-        block = max(2, int(agents / (OFTEN * wakers)))
     while math.gcd(block, agents) > 1:
         block += 1
     return block
 
 
 def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
-    """How many of its next turns an agent gives away: all if it rests and is final, else floor(c x idle rounds).
-
-    A mover gives away those up to its next anchor, where less than a third moves, all that rest are settled and no
-    frames are lost. Where frames are lost, who has just arrived gives nothing away: it says so again.
-    """
+    """How many of its next turns an agent that rests gives away: all if it is final, else floor(c x idle rounds)."""
     rules = memory.rules
-    if not who.members or memory.deaf:
+    if memory.idle_since < 0 or not who.members or memory.deaf:
         return 0
     if who.members > rules.lease_share * who.alive:
         return 0
-    if memory.idle_since < 0:
-        return rules.anchor_every if who.lends else 0
-    idle = slot - memory.idle_since
-    if memory.idle_since > memory.born and idle < ROUNDS_TOLD * rules.agents and memory.lost >= FEW:
-        return 0
     if final:
         return rules.main_every if who.informed else 1
-    turns = rules.depth_rate * idle / rules.agents
+    turns = rules.depth_rate * (slot - memory.idle_since) / rules.agents
     return int(min(turns, rules.anchor_every))
 
 
@@ -163,27 +161,22 @@ def is_open(memory: Memory, who: Electorate, turn: int) -> bool:
     return not any(is_spare(memory, who, t) for t in range(first, turn))
 
 
-def is_kept(memory: Memory, turn: int) -> bool:
-    """Whether a turn stays with an owner that rests and may get another goal: it must be heard soon when it wakes."""
-    n = memory.rules.agents
-    return (turn // n + turn % n) % KEPT_EVERY == 0 or memory.is_anchor(turn)
-
-
 def is_spare(memory: Memory, who: Electorate, turn: int) -> bool:
     """Whether a turn is one that its owner gives away, as far as is known."""
     owner = memory.owner(turn)
-    kept = memory.is_main(turn) if who.settled[owner] else is_kept(memory, turn)
+    kept = memory.is_main(turn) if who.settled[owner] else memory.is_anchor(turn)
     return who.rests[owner] and turn >= memory.rules.agents and not kept
 
 
-def is_lent(memory: Memory, who: Electorate, turn: int) -> bool:
-    """Whether a turn is one that a mover gives away, or keeps, as it is worth most; as far as is known."""
-    free = turn >= memory.rules.agents and turn not in memory.leases and not memory.is_anchor(turn)
-    return who.lends and who.able[memory.owner(turn)] and free
-
-
 def issue(
-    memory: Memory, self_index: int, table: Table, slot: int, c_s: int, own_depth: int | None, final: bool
+    memory: Memory,
+    self_index: int,
+    table: Table,
+    slot: int,
+    velocity: Vector,
+    c_s: int,
+    own_depth: int | None,
+    final: bool,
 ) -> bytes:
     """The lease bytes of a frame in an own turn: what was given away before is said again, what is new is noted.
 
@@ -191,31 +184,27 @@ def issue(
     :param own_depth: how many own turns at most; None: as :func:`depth` says.
     :returns: a byte a turn, up to the last that is given away.
     """
-    who = electorate(memory, self_index, table, slot, final)
-    idle = memory.idle_since >= 0
+    who = electorate(memory, self_index, table, slot, velocity, final)
     foreseen = slot + 1  # up to here, excluded
     rounds_mine = depth(memory, who, slot, final) if own_depth is None else own_depth
-    rounds_adopted = memory.rules.anchor_every if idle else 1
+    rounds_adopted = memory.rules.anchor_every if memory.idle_since >= 0 else 1
     said = []
     for turn in memory.turns_of_leases(slot, c_s, LEASE_ROOM):
         mine = memory.owner(turn) == self_index
         rounds_ahead = -(-(turn - slot) // memory.rules.agents)  # rounded up
-        if mine and not (final and idle) and memory.is_anchor(turn):
+        if mine and not final and memory.is_anchor(turn):
             rounds_mine = 0
         reach = rounds_mine if mine else rounds_adopted
-        kept = mine and idle and not final and is_kept(memory, turn)
-        if turn not in memory.leases and not kept and rounds_ahead <= reach and not memory.probation:
+        if turn not in memory.leases and rounds_ahead <= reach and not memory.probation:
             lessee = 0
-            if idle and mine and is_open(memory, who, turn):
+            if mine and is_open(memory, who, turn):
                 lessee = OPEN
             elif who.members and (mine or not memory.deaf):
                 if foreseen == slot + 1:
                     who.rights = look_ahead(memory, who, slot)
-                foresee(memory, self_index, who, range(foreseen, turn))
+                foresee(memory, who, range(foreseen, turn))
                 foreseen = turn
                 lessee = choose_lessee(memory, who, turn) + 1
-                if mine and (lessee == self_index + 1 or (not idle and keeps(memory, who, turn))):
-                    lessee = 0
             if lessee:
                 memory.leases[turn] = Lease(lessee, self_index + 1)
         said.append(memory.leases[turn].lessee if turn in memory.leases else 0)
@@ -227,49 +216,30 @@ def look_ahead(memory: Memory, who: Electorate, slot: int) -> list[list[int]]:
     rights: list[list[int]] = [[] for _ in range(memory.rules.agents)]
     for turn in range(slot + 1, slot + memory.window):
         sender = memory.scheduled(turn)
-        if sender >= 0 and not is_lent(memory, who, turn):
+        if sender >= 0:
             rights[sender].append(turn)
     return rights
 
 
-def foresee(memory: Memory, self_index: int, who: Electorate, turns: range) -> None:
-    """Who will send in the turns to come: as far as is known; else whom a settled owner or a mover will choose."""
+def foresee(memory: Memory, who: Electorate, turns: range) -> None:
+    """Who will send in the turns to come, as far as is known."""
     for turn in turns:
-        sender, owner = memory.scheduled(turn), memory.owner(turn)
-        spare = turn not in memory.leases and who.settled[owner] and is_spare(memory, who, turn)
-        lent = is_lent(memory, who, turn) and not keeps(memory, who, turn)
-        if owner != self_index and (lent or (spare and not is_open(memory, who, turn))):
-            sender = choose_lessee(memory, who, turn)
+        sender = memory.scheduled(turn)
         if sender >= 0:
             who.last[sender] = turn
 
 
-def keeps(memory: Memory, who: Electorate, turn: int) -> bool:
-    """Whether a mover keeps a turn of its own, for without it it would wait for longer than a round.
-
-    No later turn in that time is its, or can be given to it.
-    """
-    owner = memory.owner(turn)
-    end = who.last[owner] + memory.rules.agents
-    if any(turn < right <= end for right in who.rights[owner]):
-        return False
-    unsaid = (t for t in range(turn + 1, end + 1) if t not in memory.leases)
-    return not any(is_spare(memory, who, t) or is_lent(memory, who, t) for t in unsaid)
-
-
 def worth(memory: Memory, who: Electorate, k: int, turn: int) -> int:
-    """What a turn is worth to an agent: p min(n, m).
+    """What a turn is worth to an agent: p min(n, m), times its need.
 
     p and n are the distances from the turn to the agent's previous and next slot, as far as they are known or foreseen;
-    p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off, because more leases will come
-    in between: m is N_p, or 3/4 of it where movers give turns away, too, so that there the wait decides.
+    p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off at m = N_p, because more leases
+    will come in between.
     """
-    longest, most = memory.rules.agents + 1, who.members
-    if who.lends:
-        most = (3 * who.members + 3) // 4
+    longest = memory.rules.agents + 1
     before = min(turn - who.last[k], longest)
     after = next((right - turn for right in who.rights[k] if right > turn), longest)
-    return before * min(after, most)
+    return before * min(after, who.members) * who.need[k]
 
 
 def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> int:
@@ -281,12 +251,14 @@ def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> 
     return max(able, key=lambda k: worth(memory, who, k, turn), default=-1)  # the first of several
 
 
-def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: bool, leases: bytes) -> list[int]:
+def hand_on(
+    memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leases: bytes
+) -> list[int]:
     """Hands on turns that the agent was given; not the next slot's: frames may arrive late.
 
     If it rests, all within reach that come before its last turn there, in which it can hand on further ones; beyond the
     relay's reach all to one agent, to whom the first of them is worth most. If it moves, those within the relay's reach
-    that are worth much more to somebody else. The turn's owner, which has given it away, is left out.
+    that are worth much more to another agent. The turn's owner, which has given it away, is left out.
 
     :param leases: the frame's lease bytes; with more than one section of them there is no room for a far lessee.
     :returns: the turns handed on; at most eight within the relay's reach, the others to one agent.
@@ -300,10 +272,9 @@ def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: boo
     given = [t for t in (mine[:-1] if idle else mine) if t in memory.leases]
     if not given:
         return handed
-    who = electorate(memory, self_index, table, slot, final)
+    who = electorate(memory, self_index, table, slot, velocity, final)
     who.rights = look_ahead(memory, who, slot)
     who.last[self_index] = slot
-    factor = MORE if memory.lost < MANY * ROUNDS * memory.rules.agents else MUCH_MORE
     foreseen = slot + 1  # up to here, excluded
     heir = -1  # to whom all turns beyond the relay's reach go
     for turn in given:
@@ -312,12 +283,12 @@ def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: boo
             continue
         k = heir
         if not far or heir < 0:
-            foresee(memory, self_index, who, range(foreseen, turn))
+            foresee(memory, who, range(foreseen, turn))
             foreseen = turn
             k = choose_lessee(memory, who, turn, but=self_index)
         if k < 0 or k == memory.owner(turn):
             continue
-        if idle or worth(memory, who, k, turn) >= factor * worth(memory, who, self_index, turn):
+        if idle or worth(memory, who, k, turn) >= MORE * worth(memory, who, self_index, turn):
             memory.leases[turn] = Lease(k + 1, HANDED)
             handed.append(turn)
             heir = k if far else -1

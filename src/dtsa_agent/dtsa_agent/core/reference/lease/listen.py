@@ -33,11 +33,11 @@ def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: Exte
     if memory.owner(slot) == sender:
         memory.settled[sender] = any(memory.owner(turn) == sender and memory.is_anchor(turn) for turn, _ in given)
     for turn, lessee in given:
-        memory.note(self_index, sender + 1, turn, lessee, sender + 1)
+        memory.note(self_index, slot, sender + 1, turn, lessee, sender + 1)
     for ahead, lessee in frame.relay:
-        memory.note(self_index, sender + 1, slot + ahead, lessee, 0)
+        memory.note(self_index, slot, sender + 1, slot + ahead, lessee, 0)
     for ahead in frame.far:
-        memory.note(self_index, sender + 1, slot + ahead, frame.far_lessee, 0)
+        memory.note(self_index, slot, sender + 1, slot + ahead, frame.far_lessee, 0)
 
 
 def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, was_absent: bool) -> None:
@@ -82,7 +82,6 @@ def note_silence(memory: Memory, slot: int) -> None:
     k = memory.expected
     if k < 0 or memory.missed[k] >= MISSED or memory.absent(k, slot):
         return
-    memory.lost += 1.0
     if memory.silence <= DEAF:
         memory.silence += 1
     if memory.silence <= DEAF:

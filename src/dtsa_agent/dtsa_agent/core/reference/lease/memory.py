@@ -9,10 +9,9 @@ from dtsa_agent.core.reference.rules import Rules
 
 DEAF = 4  # more silent slots in a row than this, and an agent is presumed deaf
 MISSED = 4  # who missed so many expected turns gets no leases
-ROUNDS = 8  # in which missed frames are counted
 GONE = -(2**61)  # in ``heard``: said that it leaves
 HANDED = 255  # in place of an issuer: the agent itself was given the turn, and has handed it on
-NEVER = -1  # in ``heard``, ``woke``, ``idle_since``
+NEVER = -1  # in ``heard``, ``woke``, ``idle_since``, ``spoke``
 
 
 @dataclass(slots=True)
@@ -45,13 +44,13 @@ class Memory:
     woke: int = NEVER  # slot in which it woke or joined, and since when nobody is known to have heard it
     attempts: int = 0  # frames in OPEN turns since then
     wakers: float = 0.0  # w: about so many agents woke in the last N slots
-    lost: float = 0.0  # about so many frames were missed in the last 8 N slots
     silence: int = 0  # own silence: silent slots in a row
     expected: int = -1  # who was expected in this slot, -1: nobody in particular
     heard_now: bool = False  # something was heard in this slot
     probation: bool = False
     anchored: bool = False  # an own anchor is over since probation began
     claimed: int = 0  # slot in which probation began or was last confirmed
+    spoke: int = NEVER  # slot of its last frame
     leaving: bool = False  # said in this slot that it leaves
 
     def patience(self, k: int) -> int:
@@ -105,27 +104,30 @@ class Memory:
             return -1
         return owner
 
-    def note(self, self_index: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
+    def note(self, self_index: int, slot: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
         """Takes note of what a frame says of a turn.
 
-        Who has been given a turn may hand it on, in a frame of its own; what is relayed later changes nothing. What the
-        agent itself has given away or handed on never is its own again. Of two that gave the turn away, which adoption
-        alone can cause, the smaller lessee stays, so that all who know both agree.
+        The lessee may hand the turn on, in a frame of its own; what is relayed later changes nothing. So a turn can
+        come back to the agent itself, but not by an older frame than its own last one, which may not know what that
+        said of the turn. Of two that gave the turn away, which adoption alone can cause, the smaller lessee stays, so
+        that all who know both agree.
 
+        :param slot: of the frame.
         :param issuer: id of who gave it away, 0: the sender relays it.
         """
         if not self.now < turn < self.now + self.window or self.is_main(turn):
             return
-        there = self.leases.get(turn)
-        if there is None:
+        known, mine = self.leases.get(turn), lessee == self_index + 1
+        if known is None:
             self.leases[turn] = Lease(lessee, issuer)
-        elif there.issuer in (self_index + 1, HANDED) and (sender != there.lessee or lessee == self_index + 1):
-            return
-        elif lessee == there.lessee:
-            there.issuer = there.issuer or issuer
-        elif sender == there.lessee:
-            there.lessee = lessee
-        elif issuer and there.issuer and issuer != there.issuer and lessee < there.lessee:
+        elif lessee == known.lessee:
+            known.issuer = known.issuer or issuer
+        elif sender == known.lessee:
+            if not mine:
+                known.lessee = lessee
+            elif slot > self.spoke:
+                self.leases[turn] = Lease(lessee, 0)
+        elif known.issuer not in (0, issuer, self_index + 1, HANDED) and issuer and lessee < known.lessee:
             self.leases[turn] = Lease(lessee, issuer)
 
     def turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
@@ -160,9 +162,8 @@ class Memory:
             self.woke = slot
 
     def roll(self, self_index: int, slot: int) -> None:
-        """A slot begins: earlier turns are over; the estimates of how many woke and of missed frames fall."""
+        """A slot begins: earlier turns are over; the estimate of how many woke falls."""
         for turn in [turn for turn in self.leases if turn < slot]:
             del self.leases[turn]
         self.now = self.heard[self_index] = slot
         self.wakers -= self.wakers / self.rules.agents
-        self.lost -= self.lost / (ROUNDS * self.rules.agents)

@@ -5,44 +5,33 @@
 
 #include "lease.h"
 
-static const double OFTEN = 2.0, FEW = 0.5, MANY = 0.1; /* MANY: share of frames */
+static const double NEED = 50.0, MOST_NEED = 6000.0; /* NEED: s/m */
 
-enum {
-    KEPT_EVERY = 2,  /* who may get another goal keeps its turn of every so many rounds */
-    ROUNDS_TOLD = 3, /* who has arrived says so for so many rounds, where frames are lost */
-    MORE = 2, /* a mover hands on turns that are worth so many times as much to somebody else */
-    MUCH_MORE =
-        3 /* ... where many frames are lost, so that some of those named do not learn of it */
-};
+enum { MORE = 2 }; /* a mover hands on turns that are worth so many times as much to another one */
 
 typedef struct {
-    int alive;     /* N_alive: me and those heard of lately */
-    int members;   /* N_p: those in A_p that do not miss their turns */
-    int block;     /* one turn in so many is OPEN, 0: none */
-    int informed;  /* all have spoken, or all know where all want to be */
-    int lends;     /* movers give turns away, too: most rest, all of them settled, and no frames are
-                      lost */
-    int64_t *last; /* (n) last slot in which each sent, or is foreseen to send */
-    int64_t *next; /* (n) next slot in which each is known to send */
+    int alive;       /* N_alive: me and those heard of lately */
+    int members;     /* N_p: those in A_p that do not miss their turns */
+    int block;       /* one turn in so many is OPEN, 0: none */
+    int informed;    /* all have spoken, or all know where all want to be */
+    int64_t *last;   /* (n) last slot in which each sent, or is foreseen to send */
+    int64_t *next;   /* (n) next slot in which each is known to send */
     uint16_t *again; /* (w) slots from each turn to the next one of the same agent */
+    int32_t *need;   /* (n) weight of each: more the more its velocity has just changed */
     uint8_t *able;   /* (n) may be given a turn */
     uint8_t *rests;  /* (n) gives its turns away, as far as is known */
     uint8_t *sure;   /* (n) rests and is settled: gives anchors away, but for main ones */
     uint8_t *list;   /* (members) those able */
 } electorate;
 
-/* Slots of which one turn goes to those who wake: S turns of those that rest lie in so many; half
- * as many more where all of them are settled; OFTEN for each that wakes, if that is more. No factor
- * in common with n, or the same few owners would always pay. */
+/* Slots of which one turn goes to agents that wake: S turns of those that rest lie in so many; half
+ * as many more where all of them are settled. No factor in common with n, or the same few owners
+ * would always pay. */
 static int open_block(int every, const lease_scope *v, int resting, int settled)
 {
     if (!every || !resting) return 0;
     int block = (every * v->n + resting - 1) / resting;
     if (settled == resting) block += block / 2;
-    if (block * OFTEN * v->a->wakers > v->n) {
-        const int often = (int)(v->n / (OFTEN * v->a->wakers));
-        block = often > 2 ? often : 2;
-    }
     while (common_factor((uint64_t)block, (uint64_t)v->n) > 1) block++;
     return block;
 }
@@ -52,7 +41,7 @@ static int is_presumed(const dtsa_agent *agent, const lease_scope *v, int k, int
 {
     const dtsa_table *table = agent->table;
     return v->a->born == 0 && slot < v->n && table->config->targets_known && k != agent->self &&
-           table->sent_slot[k] < 0;
+           table->sent_slot[k] < 0 && !lease_absent(v, k, slot);
 }
 
 /* Whether an agent has something to say when it starts. */
@@ -66,15 +55,28 @@ static int sets_out(const dtsa_config *c, int k)
     return sqrt(e2) > c->r_min;
 }
 
+/* How much the wait of an agent counts: 1, and 1 more for each 2 cm/s by which its velocity has
+ * changed in its last frame. It has just turned, and others extrapolate a velocity that it may not
+ * keep. */
+static int32_t need(double innovation)
+{
+    const double more = NEED * innovation;
+    return 1 + (int32_t)(more < MOST_NEED ? more : MOST_NEED);
+}
+
 static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int64_t slot,
                              electorate *who)
 {
     const dtsa_table *table = agent->table;
     const int self = agent->self;
     int resting = 0, settled = 0;
+    double innovation = 0.0; /* of the frame that is being made */
+    for (int i = 0; i < 3; i++)
+        innovation += fabs(agent->velocity[i] - table->sent_v[i * v->n + self]);
     who->last = (int64_t *)(void *)table->scratch;
     who->next = who->last + v->n;
-    who->again = (uint16_t *)(who->next + v->n);
+    who->need = (int32_t *)(void *)(who->next + v->n);
+    who->again = (uint16_t *)(who->need + v->n);
     who->able = (uint8_t *)(who->again + v->window);
     who->rests = who->able + v->n;
     who->sure = who->rests + v->n;
@@ -94,12 +96,9 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
         who->sure[k] = who->rests[k] && (k == self ? agent->final : presumed || v->settled[k]);
         settled += who->sure[k];
         who->last[k] = table->sent_slot[k] < 0 ? slot - v->n : table->sent_slot[k];
+        who->need[k] = need(k == self ? innovation : table->innovation[k]);
     }
     who->informed = slot >= v->n || table->config->targets_known;
-    const int few_move = settled && settled == resting && 3 * who->members < v->n;
-    /* In the first round those that wait for a goal are taken for settled, and give a mover
-     * nothing. */
-    who->lends = slot >= v->n && few_move && v->a->lost < FEW;
     who->block = open_block(table->config->lease.open_every, v, resting, settled);
 }
 
@@ -112,14 +111,14 @@ static int count_absent_before(const lease_scope *v, int64_t slot)
 }
 
 /* What a turn is worth to an agent: its wait before it, times the wait that follows, as far as that
- * is short.
+ * is short, times its need.
  *
  * next: slot in which it is known to send after the turn. */
 static long worth(const lease_scope *v, const electorate *who, int k, int64_t turn, int64_t next)
 {
-    const int most = who->lends ? (3 * who->members + 3) / 4 : who->members;
     const int64_t wait = turn - who->last[k], rest = next - turn;
-    return (wait <= v->n ? (long)wait : v->n + 1) * (rest < most ? (long)rest : most);
+    return (wait <= v->n ? (long)wait : v->n + 1) *
+           (rest < who->members ? (long)rest : who->members) * who->need[k];
 }
 
 /* To whom a turn is worth most. -1: nobody is able. */
@@ -137,27 +136,12 @@ static int choose_lessee(const lease_scope *v, const electorate *who, int64_t tu
     return best;
 }
 
-/* Whether a turn stays with an owner that rests and may get another goal: it must be heard soon
- * when it wakes. */
-static int is_kept(const lease_scope *v, int64_t turn)
-{
-    return (turn / v->n + turn % v->n) % KEPT_EVERY == 0 || lease_is_anchor(v, turn);
-}
-
 /* Whether a turn is one that its owner gives away, as far as is known. */
 static int is_spare(const lease_scope *v, const electorate *who, int64_t turn)
 {
     const int owner = (int)(turn % v->n);
     if (!who->rests[owner] || turn < v->n) return 0;
-    return who->sure[owner] ? !lease_is_main(v, turn) : !is_kept(v, turn);
-}
-
-/* Whether a turn is one that a mover gives away, or keeps, as it is worth most; as far as is known.
- */
-static int is_lent(const lease_scope *v, const electorate *who, int64_t turn)
-{
-    return who->lends && who->able[turn % v->n] && turn >= v->n && !lease_is_anchor(v, turn) &&
-           v->lessee[turn % v->window] == LEASE_NONE;
+    return who->sure[owner] ? !lease_is_main(v, turn) : !lease_is_anchor(v, turn);
 }
 
 /* One turn in each block is for those who wake: the first one that its owner gives away. */
@@ -177,54 +161,22 @@ static void look_ahead(const lease_scope *v, electorate *who, int64_t slot, int 
     for (int k = 0; k < v->n; k++) who->next[k] = INT64_MAX;
     for (int64_t t = slot + (turns < v->window ? turns : v->window - 1); t > slot; t--) {
         const int k = lease_scheduled(v, t);
-        if (k < 0 || is_lent(v, who, t)) continue;
+        if (k < 0) continue;
         const int64_t rest = who->next[k] - t;
         who->again[t % v->window] = (uint16_t)(rest < UINT16_MAX ? rest : UINT16_MAX);
         who->next[k] = t;
     }
 }
 
-/* Whether a mover keeps a turn of its own, for without it it would wait for longer than a round: no
- * later turn in that time is its, or can be given to it. */
-static int keeps(const lease_scope *v, const electorate *who, int64_t turn)
-{
-    const int owner = (int)(turn % v->n);
-    const int64_t end = who->last[owner] + v->n;
-    if (who->next[owner] <= end) return 0;
-    for (int64_t t = turn + 1; t <= end; t++)
-        if (v->lessee[t % v->window] == LEASE_NONE && (is_spare(v, who, t) || is_lent(v, who, t)))
-            return 0;
-    return 1;
-}
-
-/* Who will send in the slots before a turn: as far as is known, and where a settled owner or a
- * mover has not said it yet, the one to whom it will be worth most.
- *
- * from: the first of these slots. */
+/* Notes who will send in the slots before a turn, as far as is known. from: the first of them. */
 static void foresee(const lease_scope *v, electorate *who, int64_t from, int64_t turn)
 {
     for (int64_t t = from; t < turn; t++) {
-        const int owner = (int)(t % v->n), given = v->lessee[t % v->window];
-        int k = lease_scheduled(v, t);
-        if (k >= 0 && who->next[k] == t) who->next[k] = t + who->again[t % v->window];
-        const int spare = given == LEASE_NONE && who->sure[owner] && is_spare(v, who, t);
-        const int lent = is_lent(v, who, t) && !keeps(v, who, t);
-        if (owner != v->self && (lent || (spare && !is_open(v, who, t))))
-            k = choose_lessee(v, who, t);
-        if (k >= 0) who->last[k] = t;
+        const int k = lease_scheduled(v, t);
+        if (k < 0) continue;
+        if (who->next[k] == t) who->next[k] = t + who->again[t % v->window];
+        who->last[k] = t;
     }
-}
-
-/* Whether a turn is this agent's to give away now.
- *
- * reach: so many rounds ahead the turns of its owner are. */
-static int may_give(const dtsa_agent *agent, const lease_scope *v, int64_t slot, int64_t turn,
-                    int reach)
-{
-    const int idle = v->a->idle_since >= 0, mine = turn % v->n == v->self;
-    if (v->lessee[turn % v->window] != LEASE_NONE || v->a->probation) return 0;
-    if (mine && idle && !agent->final && is_kept(v, turn)) return 0;
-    return (turn - slot + v->n - 1) / v->n <= reach;
 }
 
 /* To whom a turn is given; LEASE_NONE: to nobody, it is kept.
@@ -233,15 +185,13 @@ static int may_give(const dtsa_agent *agent, const lease_scope *v, int64_t slot,
 static uint8_t choose_heir(const lease_scope *v, electorate *who, int64_t slot, int64_t turn,
                            int64_t *from)
 {
-    const int idle = v->a->idle_since >= 0, mine = turn % v->n == v->self;
-    if (idle && mine && is_open(v, who, turn)) return LEASE_OPEN;
+    const int mine = turn % v->n == v->self;
+    if (mine && is_open(v, who, turn)) return LEASE_OPEN;
     if (!who->members || !(mine || v->a->deaf <= LEASE_DEAF)) return LEASE_NONE;
     if (*from == slot + 1) look_ahead(v, who, slot, v->window - 1);
     foresee(v, who, *from, turn);
     *from = turn;
-    const int k = choose_lessee(v, who, turn);
-    if (mine && (k == v->self || (!idle && keeps(v, who, turn)))) return LEASE_NONE;
-    return (uint8_t)(k + 1);
+    return (uint8_t)(choose_lessee(v, who, turn) + 1);
 }
 
 /* How many of its next turns an agent gives away. */
@@ -249,11 +199,8 @@ static int depth(const dtsa_agent *agent, const lease_scope *v, const electorate
 {
     const dtsa_lease_config *c = &agent->table->config->lease;
     const lease_agent *a = v->a;
-    if (!who->members || a->deaf > LEASE_DEAF) return 0;
+    if (a->idle_since < 0 || !who->members || a->deaf > LEASE_DEAF) return 0;
     if (who->members > c->share * who->alive) return 0;
-    if (a->idle_since < 0) return who->lends ? v->every : 0;
-    const int arrived = a->idle_since > a->born && slot - a->idle_since < ROUNDS_TOLD * v->n;
-    if (arrived && a->lost >= FEW) return 0;
     if (agent->final) return who->informed ? v->main : 1;
     const double turns = c->depth_rate * (double)(slot - a->idle_since) / v->n;
     return turns < v->every ? (int)turns : v->every;
@@ -267,14 +214,15 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
     const int count = lease_turns(v, slot, e->c_s, turns, LEASE_ROOM);
     int64_t from = slot + 1;
     count_electorate(agent, v, slot, &who);
-    const int idle = v->a->idle_since >= 0, adopted = idle ? v->every : 1;
+    const int adopted = v->a->idle_since >= 0 ? v->every : 1;
     int own = e->leaving ? 0 : depth(agent, v, &who, slot);
     for (int i = 0; i < count; i++) {
         const int64_t turn = turns[i];
         const int mine = turn % v->n == v->self;
         uint8_t *given = &v->lessee[turn % v->window];
-        if (mine && !(agent->final && idle) && lease_is_anchor(v, turn)) own = 0;
-        if (may_give(agent, v, slot, turn, mine ? own : adopted)) {
+        if (mine && !agent->final && lease_is_anchor(v, turn)) own = 0;
+        const int rounds = (int)((turn - slot + v->n - 1) / v->n); /* ahead, rounded up */
+        if (*given == LEASE_NONE && !v->a->probation && rounds <= (mine ? own : adopted)) {
             *given = choose_heir(v, &who, slot, turn, &from);
             if (*given != LEASE_NONE) v->issuer[turn % v->window] = (uint8_t)(v->self + 1);
         }
@@ -283,21 +231,14 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
     }
 }
 
-/* Whether a mover's turn is worth much more to somebody else. */
-static int is_dispensable(const lease_scope *v, const electorate *who, int k, int64_t turn)
-{
-    const long own = worth(v, who, v->self, turn, turn + who->again[turn % v->window]);
-    const int factor = v->a->lost < MANY * LEASE_MEMORY * v->n ? MORE : MUCH_MORE;
-    return worth(v, who, k, turn, who->next[k]) >= factor * own;
-}
-
-/* To whom this agent hands a turn on that it was given. -1: to nobody. Its owner has given it away.
- */
+/* To whom this agent hands a turn on that it was given: if it rests, or the turn is worth much more
+ * to that one. -1: to nobody. Its owner has given it away. */
 static int choose_next(const lease_scope *v, const electorate *who, int idle, int64_t turn)
 {
     const int k = choose_lessee(v, who, turn);
     if (k < 0 || k == v->self || k == turn % v->n) return -1;
-    return idle || is_dispensable(v, who, k, turn) ? k : -1;
+    const long own = worth(v, who, v->self, turn, turn + who->again[turn % v->window]);
+    return idle || worth(v, who, k, turn, who->next[k]) >= MORE * own ? k : -1;
 }
 
 /* Hands a turn on to another agent, by its index. */
@@ -310,8 +251,8 @@ static void hand(lease_scope *v, electorate *who, int64_t turn, int k)
 
 /* Hands on turns that this agent was given. If it rests: all within reach that come before its last
  * turn there, in which it can hand on further ones; beyond the relay's reach all to one agent, to
- * whom the first of them is worth most. If it moves: those that are worth much more to somebody
- * else. Not the next slot's: frames may arrive late.
+ * whom the first of them is worth most. If it moves: those that are worth much more to another one. Not
+ * the next slot's: frames may arrive late.
  *
  * -> mask of the turns handed on, as in relay_mask; e->far_* says those beyond. */
 static uint32_t hand_on(const dtsa_agent *agent, lease_scope *v, int64_t slot, extended_frame *e)
@@ -376,6 +317,7 @@ void lease_fill(dtsa_agent *agent, int64_t slot, extended_frame *e)
     e->probation = v.a->probation;
     e->leaving = own_turn && agent->present == PRESENT_LEAVING;
     v.a->leaving = (uint8_t)e->leaving;
+    v.a->spoke = slot;
     if (agent->table->config->lease.adoption && !v.a->probation && !e->leaving)
         e->c_s = count_absent_before(&v, slot);
     if (own_turn) issue(agent, &v, slot, e);

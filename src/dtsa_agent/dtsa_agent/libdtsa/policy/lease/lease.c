@@ -89,26 +89,28 @@ int lease_scheduled(const lease_scope *v, int64_t slot)
     return owner;
 }
 
-void lease_note(lease_scope *v, int sender, int64_t turn, int lessee, int issuer)
+void lease_note(lease_scope *v, int64_t slot, int sender, int64_t turn, int lessee, int issuer)
 {
     if (lessee == LEASE_NONE || turn <= v->a->now || turn >= v->a->now + v->window ||
         lease_is_main(v, turn))
         return;
-    uint8_t *there = &v->lessee[turn % v->window], *by = &v->issuer[turn % v->window];
-    /* What I have given away or handed on never is mine again. */
-    const int given = *by == v->self + 1, handed = *by == LEASE_HANDED;
-    if ((given || handed) && (sender != *there || lessee == v->self + 1)) return;
-    if (*there == LEASE_NONE) {
-        *there = (uint8_t)lessee;
+    uint8_t *known = &v->lessee[turn % v->window], *by = &v->issuer[turn % v->window];
+    const int mine = lessee == v->self + 1, from_me = *by == v->self + 1 || *by == LEASE_HANDED;
+    if (*known == LEASE_NONE) {
+        *known = (uint8_t)lessee;
         *by = (uint8_t)issuer;
-    } else if (lessee == *there) {
+    } else if (lessee == *known) {
         if (!*by) *by = (uint8_t)issuer;
-    } else if (sender == *there) { /* whose turn it was hands it on */
-        *there = (uint8_t)lessee;
-    } else if (issuer && *by && issuer != *by && lessee < *there) {
+    } else if (sender == *known) {
+        /* Its lessee hands it on. An older frame than my own last one may not know what that said
+         * of the turn. */
+        if (mine && slot <= v->a->spoke) return;
+        *known = (uint8_t)lessee;
+        if (mine) *by = 0;
+    } else if (!from_me && issuer && *by && issuer != *by && lessee < *known) {
         /* Two have given it away: only adoption can do that. The smaller id, so that all who know
          * both agree. */
-        *there = (uint8_t)lessee;
+        *known = (uint8_t)lessee;
         *by = (uint8_t)issuer;
     }
 }
@@ -140,7 +142,6 @@ static void roll(lease_scope *v, int64_t slot)
     }
     a->now = v->heard[v->self] = slot;
     a->wakers -= a->wakers / v->n;
-    a->lost -= a->lost / (LEASE_MEMORY * v->n);
 }
 
 static void lease_begin(dtsa_agent *agent)
@@ -155,7 +156,7 @@ static void start(lease_scope *v, int64_t slot)
     lease_agent *a = v->a;
     a->started = 1;
     a->born = a->now = a->claimed = slot;
-    a->idle_since = a->woke = -1;
+    a->idle_since = a->woke = a->spoke = -1;
     for (int k = 0; k < v->n; k++) v->heard[k] = -1;
     if (slot == 0) return;
     a->probation = 1;
@@ -301,17 +302,17 @@ static void lease_listen(dtsa_agent *agent, int64_t slot, const extended_frame *
         int64_t turns[SECTIONS * SECTION_BYTES];
         const int count = lease_turns(&v, slot, e->c_s, turns, e->lease_count);
         for (int i = 0; i < count; i++) {
-            lease_note(&v, e->own.sender, turns[i], e->leases[i], e->own.sender);
+            lease_note(&v, slot, e->own.sender, turns[i], e->leases[i], e->own.sender);
             if (e->leases[i] && turns[i] % v.n == sender && lease_is_anchor(&v, turns[i]))
                 v.settled[sender] = 1;
         }
     }
     for (int d = 0, i = 0; d < RELAY_REACH && e->relay_mask >> d; d++)
         if (e->relay_mask >> d & 1)
-            lease_note(&v, e->own.sender, slot + 1 + d, e->relay_ids[i++], 0);
+            lease_note(&v, slot, e->own.sender, slot + 1 + d, e->relay_ids[i++], 0);
     for (int b = 0; b < 8 * FAR_BYTES && e->far_id; b++)
         if (e->far_mask[b >> 3] >> (b & 7) & 1)
-            lease_note(&v, e->own.sender, slot + RELAY_REACH + 1 + b, e->far_id, 0);
+            lease_note(&v, slot, e->own.sender, slot + RELAY_REACH + 1 + b, e->far_id, 0);
 }
 
 /* ---- the slot is over ---- */
@@ -335,7 +336,6 @@ static void note_silence(const lease_scope *v, int64_t slot)
     if (a->expected < 0 || v->miss[a->expected] >= LEASE_MISSED ||
         lease_absent(v, a->expected, slot))
         return;
-    a->lost += 1.0;
     if (a->deaf <= LEASE_DEAF) a->deaf++;
     if (a->deaf <= LEASE_DEAF) v->miss[a->expected]++;
 }

@@ -7,7 +7,6 @@
 enum {
     LEASE_DEAF = 4,   /* more silent slots in a row than this, and an agent is presumed deaf */
     LEASE_MISSED = 4, /* who missed so many expected turns gets no leases */
-    LEASE_MEMORY = 8, /* rounds in which missed frames are counted */
     LEASE_HANDED =
         255 /* in place of an issuer: this agent was given the turn, and has handed it on */
 };
@@ -21,8 +20,8 @@ typedef struct lease_agent {
     int64_t woke;    /* slot in which it woke or joined and since when nobody is known to have heard
                         it, -1: none */
     int64_t claimed; /* slot in which probation began or was last confirmed */
+    int64_t spoke;   /* slot of the last frame of its own, -1: none */
     double wakers;   /* agents that woke lately: about so many in the last n slots */
-    double lost;     /* frames missed lately: about so many in the last 8 n slots */
     int32_t expected; /* 0-based agent expected in this slot, -1: nobody in particular */
     int32_t deaf;     /* silent slots in a row */
     uint8_t started, heard_now, probation, anchored, attempts, moving, leaving;
@@ -50,9 +49,9 @@ int lease_absent(const lease_scope *v, int k, int64_t slot);
 int lease_alive(const lease_scope *v, int k, int64_t slot);
 int lease_scheduled(const lease_scope *v,
                     int64_t slot); /* 0-based agent whose turn it is in this table, -1: nobody's */
-/* Takes note of what the frame of `sender` (an id) says of a turn. issuer: who gave it away, 0: the
- * sender relays it. */
-void lease_note(lease_scope *v, int sender, int64_t turn, int lessee, int issuer);
+/* Takes note of what a frame of `slot` from `sender` (an id) says of a turn. issuer: who gave it
+ * away, 0: the sender relays it. */
+void lease_note(lease_scope *v, int64_t slot, int sender, int64_t turn, int lessee, int issuer);
 /* The turns a frame's lease bytes speak of, in order; the same for sender and receiver. -> number
  * of turns. */
 int lease_turns(const lease_scope *v, int64_t slot, int c_s, int64_t *turns, int room);
