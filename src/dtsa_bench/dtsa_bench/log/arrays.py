@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.core.frame import EXTENT_M, named_in
+from dtsa_agent.core.frame import EXTENT_M
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
@@ -210,6 +210,11 @@ class FlightArrays:
         return times[flown], self.track[flown], velocity[flown]
 
     @property
+    def instants_ns(self) -> NDArray[np.int64]:
+        """(T,) ns from the start of slot 0: the control instants of `path`."""
+        return self._instants[0]
+
+    @property
     def instants_s(self) -> Floats:
         """(T,) s from the start of slot 0: the control instants of `path`."""
         return np.asarray(self._instants[0] / 1e9)
@@ -289,8 +294,6 @@ class LogBuilder:
         self.arrays = {name: np.zeros((_BLOCK, *shape), kind) for name, (shape, kind) in self._shapes.items()}
         self.frames: list[dict[int, bytes]] = []  # by sender, a slot
         self.received: list[Mask] = []  # (F, N), a slot
-        self._heard: list[tuple[int, bytes, Mask]] = []  # as in HeardFrames: row and slot, data, by
-        self._heard_row: list[int] = []
 
     def open(self, swarm: Swarm, frames: dict[int, bytes]) -> None:
         """A slot begins: what the agents decided, and where they are.
@@ -309,11 +312,6 @@ class LogBuilder:
             arrays["length"][row, sender - 1] = len(data)
         self.frames.append(frames)
 
-    def hear(self, slot: int, data: bytes, by: Mask) -> None:
-        """Agents take a frame in as one of a slot, which may be over."""
-        self._heard.append((slot, data, by.astype(np.bool_)))
-        self._heard_row.append(self.rows)
-
     def close(self, verdict: Verdict) -> None:
         """The slot is over."""
         row, arrays = self.rows, self.arrays
@@ -330,18 +328,6 @@ class LogBuilder:
             self.received.append(np.zeros((0, self._config.swarm.agents), np.bool_))
         self.rows += 1
 
-    def close_unslotted(
-        self, outcome: int, senders: Sequence[int], heard: Sequence[tuple[int, bytes, NDArray[Any]]]
-    ) -> None:
-        """The slot of a flight without slots is over: who took a frame in that arrived in it, received its sender's."""
-        mask = np.zeros((len(senders), self._config.swarm.agents), np.bool_)
-        for _, data, by in heard:
-            told = named_in(data)
-            if told is not None and told[0] in senders:
-                mask[senders.index(told[0])] |= by.astype(np.bool_)
-        mask[np.arange(len(senders)), np.array(senders, np.intp) - 1] = False
-        self.close(Verdict(outcome, tuple(senders), mask, None, None))
-
     def fields(self, track: Floats) -> dict[str, Any]:
         """The fields of the log, with the positions (K, 3, N) of the last slot, m."""
         rows, swarm = self.rows, self._config.swarm
@@ -356,10 +342,4 @@ class LogBuilder:
             "received": received, "offset_ns": np.zeros(shape, np.int64),
             "start_ns": np.arange(rows) * swarm.slot_ns, **kept,
         }  # fmt: skip
-        if self._heard:
-            slots, frames, by = zip(*self._heard, strict=True)
-            rows_of, none = np.array(self._heard_row), np.zeros(len(slots), np.int64)
-            fields["heard"] = HeardFrames(
-                rows_of, none, np.array(slots), none, np.array(by), none.astype(np.bool_), list(frames)
-            )
         return fields

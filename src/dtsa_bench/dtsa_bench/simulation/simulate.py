@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm, make_scenario
+from dtsa_agent.core.frame import named_in
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
-from dtsa_bench.log.arrays import LogBuilder
+from dtsa_bench.log.arrays import HeardFrames
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics, may_share
@@ -38,7 +42,7 @@ class Flight:
     swarm: Swarm  # as it was at the end
     log: SlotArrays | None  # what happened in its slots
     wall_time_s: float
-    unslotted: LogBuilder | None = None  # the same of agents that send at any instant
+    heard: HeardFrames | None = None  # in a log of agents that send at any instant
 
     def summary(self) -> dict[str, Any]:
         """The results, with the keys of ``summary.json``."""
@@ -46,14 +50,29 @@ class Flight:
         result["malformed"], result["foreign"] = self.swarm.malformed, self.swarm.foreign
         return result
 
-    def flight_log(self) -> FlightLog:
-        """The flight as users have it; without its slots if it was flown without `log` and `frames`."""
-        if self.unslotted is not None:
-            return FlightLog(**self.unslotted.fields(self.swarm.track), results=self.summary())
-        fields = LogBuilder(self.run).fields(self.swarm.track)
-        if self.log is not None:
-            fields |= self.log.log_fields(self.scenario.start, self.run.swarm.slot_ns)
-        return FlightLog(**fields, results=self.summary(), is_kept=self.log is not None)
+    def to_log(self) -> FlightLog:
+        """What happened, and what follows from it; the flight was simulated with its log and its frames."""
+        arrays, config, heard = self.log, self.run.swarm, self.heard
+        assert arrays is not None
+        slots = len(arrays)
+        start = np.broadcast_to(self.scenario.start, (1, *arrays.position.shape[1:]))
+        received = arrays.received
+        if heard is not None:  # who took a frame in that arrived, received its sender's
+            received = received.copy()
+            place = np.cumsum(arrays.sent).reshape(arrays.sent.shape) - 1
+            for row, data, by in zip(heard.row.tolist(), heard.data, heard.by, strict=True):
+                sender, slot = named_in(data) or (0, 0)
+                if 0 < sender <= config.agents and slot <= row and arrays.sent[slot, sender - 1]:
+                    received[place[slot, sender - 1]] |= by
+        return FlightLog(
+            name="", settings=self.run.to_dict(), agents=config.agents, slot_ns=config.slot_ns,
+            recorded=np.ones(slots, np.bool_), known=np.ones(arrays.sent.shape, np.bool_),
+            start_ns=np.arange(slots) * config.slot_ns, outcome=arrays.outcome, length=arrays.length,
+            data=arrays.data.tobytes(), received=received, lost=arrays.lost, collided=arrays.collided,
+            chosen=arrays.chosen, reason=arrays.reason, digest=arrays.digest, score=arrays.score,
+            offset_ns=np.zeros(arrays.sent.shape, np.int64), track=np.concatenate((start, arrays.position)),
+            velocity=arrays.velocity, command=arrays.command, goal=arrays.goal, heard=heard, results=self.summary(),
+        )  # fmt: skip
 
 
 def simulate(
@@ -78,13 +97,14 @@ def simulate(
     swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared))
     writer = SlotWriter(swarm, observer, frames) if log else None
     metrics = FlightMetrics(run, scenario)
-    builder = LogBuilder(run) if log and run.swarm.policy_row.unslotted else None
+    heard: list[_Heard] | None = None
     if run.swarm.policy_row.unslotted:
-        _fly_unslotted(swarm, Channel(run.air), metrics, writer, builder)
+        heard = _fly_unslotted(swarm, Channel(run.air), metrics, writer)
     else:
         _fly(swarm, Channel(run.air), metrics, writer)
     arrays = None if writer is None else writer.finish()
-    return Flight(run, scenario, metrics, swarm, arrays, time.perf_counter() - begun, builder)
+    flight = Flight(run, scenario, metrics, swarm, arrays, time.perf_counter() - begun)
+    return flight if heard is None or not log else replace(flight, heard=_heard_frames(heard, run.swarm.agents))
 
 
 def complete_slot(
@@ -137,29 +157,43 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
     metrics.count_frames(length, metrics.kernel.frames)
 
 
-def _fly_unslotted(
-    swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None, builder: LogBuilder | None
-) -> None:
-    """The same for agents that send at any instant: what arrives in a slot is heard in it."""
+class _Heard(NamedTuple):
+    """A frame that agents took in."""
+
+    row: int  # in which slot
+    slot: int  # as one of which it was taken in
+    data: bytes
+    by: NDArray[np.bool_]  # (N,)
+
+
+def _heard_frames(heard: list[_Heard], agents: int) -> HeardFrames:
+    row, slot = (np.array([entry[k] for entry in heard], np.int64) for k in (0, 1))
+    by = np.array([entry.by for entry in heard], np.bool_).reshape(len(heard), agents)
+    none = np.zeros(len(heard), np.int64)
+    return HeardFrames(row, none, slot, none, by, none.astype(np.bool_), [entry.data for entry in heard])
+
+
+def _fly_unslotted(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None) -> list[_Heard]:
+    """The same for agents that send at any instant: what arrives in a slot is heard in it; with a log: what was."""
     traffic = UnslottedTraffic(swarm, channel)
+    heard: list[_Heard] = []
     slot, over = 0, ""
     while not over:
         swarm.scenario.advance(slot, swarm)
         carried = traffic.slot(slot)
-        heard = [*((slot, frame, mask) for frame, mask in carried.heard), *carried.combined]
-        if log is not None and builder is not None:
+        if log is not None:
             log.open_slot()
-            builder.open(swarm, {agent: swarm.frame(agent - 1) for agent in carried.senders})
-            for at, frame, mask in heard:
-                builder.hear(at, frame, mask)
-            builder.close_unslotted(carried.outcome, carried.senders, heard)
         metrics.compare_tables(slot, swarm.digest, swarm.chosen)
         swarm.fly(slot)
-        for at, frame, mask in heard:
+        arrived = [(slot, frame, mask) for frame, mask in carried.heard]
+        for at, frame, mask in (*arrived, *carried.combined):
             swarm.hear(at, frame, mask)
+            if log is not None:
+                heard.append(_Heard(slot, at, frame, mask))
         swarm.end(slot)
         over = metrics.update(slot, swarm.track, swarm, carried.outcome, carried.lengths)
         if log is not None:
             nothing = (0,) * len(carried.senders)
             log.close_slot(slot, Verdict(carried.outcome, carried.senders, None, nothing, nothing))
         slot += 1
+    return heard

@@ -65,34 +65,6 @@ class SlotArrays:
         ends = np.cumsum(self.sent.sum(axis=1)).tolist()
         return [tuple(ids[first:end]) for first, end in zip([0, *ends], ends, strict=False)]
 
-    def log_fields(self, start: Floats, slot_ns: int) -> dict[str, Any]:
-        """The fields of a log that follow from these arrays.
-
-        :param start: (3, N) m, where the agents were before slot 0.
-        :param slot_ns: ns, length of a slot.
-        """
-        slots, agents = self.sent.shape
-        track = np.empty((slots + 1, *self.position.shape[1:]))
-        track[0], track[1:] = start, self.position
-        shared = [
-            "outcome",
-            "received",
-            "lost",
-            "collided",
-            "chosen",
-            "reason",
-            "score",
-            "digest",
-            "velocity",
-            "command",
-            "goal",
-        ]
-        return {
-            **{name: getattr(self, name) for name in shared}, "length": self.length, "data": self.data.tobytes(),
-            "track": track, "recorded": np.ones(slots, np.bool_), "known": np.ones((slots, agents), np.bool_),
-            "offset_ns": np.zeros((slots, agents), np.int64), "start_ns": np.arange(slots) * slot_ns,
-        }  # fmt: skip
-
 
 class SlotWriter:
     """Memory that grows with a flight.
