@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from .row import LOCKSTEP, REALTIME, fault, in_flight
 
-_FULL_BYTES = 60_000
+_FULL_BYTES = 150_000
 _SHORT = ("--timeout-s", "1", "--no-picture")
 
 _SAVED = "the flight ends with code 1 and a line that names the file; `recover` saves a bag that verifies"
