@@ -21,7 +21,7 @@ Compiles libdtsa for a Cortex-M4F, flies 200 slots of tdma, dtsa and lease with 
 QEMU) and on this machine, compares every bit, and prints what memory, stack, code and calls cost. With --board the app
 of docs/how-to/on-board.md runs there instead, with 12 and 20 agents: what a slot costs it."""
 EXAMPLES = (
-    ("", "needs a cross compiler and QEMU, see docs/evidence/embedded.md"),
+    ("", "needs a cross compiler and QEMU, see docs/evidence/speed.md"),
     ("--board", "what a slot costs the app of Crazyflies"),
 )
 CALLS = ("slot", "command", "hear", "end")  # in the order of meter.h

@@ -1,4 +1,4 @@
-"""Integration: ages of the slot protocols without flight: `lease` beside TDMA and DTSA (docs/evidence/protocol.md)."""
+"""Integration: ages of slot protocols without flight: `lease` beside TDMA and DTSA (docs/evidence/robustness.md)."""
 
 from __future__ import annotations
 

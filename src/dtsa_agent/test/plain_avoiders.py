@@ -1,4 +1,4 @@
-"""Where to fly, as docs/reference/avoiders.md has it, in NumPy: what the compiled avoiders are compared with.
+"""Where to fly, as docs/reference/settings.md has it, in NumPy: what the compiled avoiders are compared with.
 
 Every agent commands itself only, so no other agent has to compute the same bits.
 """

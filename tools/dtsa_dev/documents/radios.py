@@ -1,4 +1,4 @@
-"""The table of radios of docs/how-to/which-radio.md, made from the formulas of ports and radios."""
+"""The table of radios of docs/how-to/radios.md, made from the formulas of ports and radios."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _Row(NamedTuple):
 
 
 def _on_board(config: SwarmConfig) -> int:
-    header = 0 if config.auth else 4  # of a datagram, see docs/reference/ports.md
+    header = 0 if config.auth else 4  # of a datagram, see docs/reference/network.md
     airtime = RADIOS["crazyflie"].airtime
     return airtime.shortest_slot_ns(header + config.frame_length, guard_ns=_GUARD_NS)
 

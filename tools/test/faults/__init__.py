@@ -1,6 +1,6 @@
 """Faults, and how the system reacts to them: each row is made to happen to real processes.
 
-``FAULTS`` has all rows in the order of the page ``docs/evidence/faults.md``, whose table is made from them.
+``FAULTS`` has all rows in the order of the page ``docs/evidence/robustness.md``, whose table is made from them.
 """
 
 from __future__ import annotations

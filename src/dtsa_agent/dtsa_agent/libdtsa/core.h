@@ -123,7 +123,7 @@ void gossip_learn(dtsa_table *table, int64_t sampled, const gossip_entry *entry)
 void gossip_confirm(dtsa_table *table, int64_t sampled, const gossip_entry *entry);
 
 /* avoider/avoider.c: command of one agent from others' states as estimated,
- * docs/reference/avoiders.md. `ages` may be NULL. */
+ * docs/reference/settings.md. `ages` may be NULL. */
 int avoid_scratch_doubles(int n);
 
 #endif

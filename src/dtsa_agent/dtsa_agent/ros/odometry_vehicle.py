@@ -1,4 +1,4 @@
-"""``ros2 run dtsa_agent agent`` with ``air:=udp`` or another port; a vehicle on the graph. docs/how-to/vehicles.md."""
+"""`ros2 run dtsa_agent agent` with a port; a vehicle on the graph. See docs/how-to/several-computers.md."""
 
 from __future__ import annotations
 

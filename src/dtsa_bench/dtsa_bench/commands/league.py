@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 `cells` lists what is flown, and the schemes that come with this program. `enter POLICY` flies one of them, or a
 plug-in, through all cells and writes an entry. `check FILE` flies a sample of the flights of its entries again and says
-what differs. `table FILE...` compares entries. How to enter: docs/how-to/league.md."""
+what differs. `table FILE...` compares entries. How to enter: docs/how-to/sweep.md."""
 
 EXAMPLES = (
     ("cells", "what is flown, and the schemes that come with the package"),

@@ -1,6 +1,6 @@
 """The league: frozen cells that any policy flies, entries that anybody can check, and the table of all.
 
-What is frozen stands in ``league-1.yaml``; see docs/how-to/league.md.
+What is frozen stands in ``league-1.yaml``; see docs/how-to/sweep.md.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_is_frozen_stays_and_all_built_in_schemes_fly_every_cell() -> None:
-    assert LEAGUE.digest == "ed7a1d2694d06ac4"  # a change needs a league of another number: docs/how-to/league.md
+    assert LEAGUE.digest == "ed7a1d2694d06ac4"  # a change needs a league of another number: docs/how-to/sweep.md
     seeds = {LEAGUE.seed(cell, k) for cell in LEAGUE.cells for k in range(LEAGUE.seed_count)}
     assert len(seeds) == len(LEAGUE.cells) * LEAGUE.seed_count
     assert all(0 <= seed < 2**31 for seed in seeds)

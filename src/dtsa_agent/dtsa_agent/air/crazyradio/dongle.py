@@ -32,7 +32,7 @@ _VENDOR, _PRODUCT = 0x1915, 0x7777
 _OUT, _IN = 0x01, 0x81
 _READ_MS, _WRITE_MS, _REQUEST_MS = 100, 20, 1000
 _BY_NUMBER = 4  # digits at most; a serial number has ten
-_RIGHTS = "one that this user may open: a udev rule gives the right (docs/how-to/crazyradio-broadcasts.md)"
+_RIGHTS = "one that this user may open: a udev rule gives the right (docs/how-to/radios.md)"
 _HOW = "tools/dtsa setup --extra cflib, or pip install pyusb libusb-package"
 
 

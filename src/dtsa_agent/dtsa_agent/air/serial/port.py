@@ -89,7 +89,7 @@ class SerialPort(DevicePort[Device]):
             self._tell_once(
                 "latency",
                 f"keeps bytes for up to {device.latency_ms} ms: as root write 1 to latency_timer of the device in"
-                " /sys/class/tty, see docs/how-to/serial-modems.md",
+                " /sys/class/tty, see docs/how-to/radios.md",
             )
 
     def _tell_once(self, key: str, what: str) -> None:

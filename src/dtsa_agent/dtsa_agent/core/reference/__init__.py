@@ -2,7 +2,7 @@
 
 Everything that agents must agree on stands here once, and once more in C (``libdtsa``), which is what flies. Both
 give the same frames, tables, decisions, digests and times, bit for bit; tests hold them together.
-docs/reference/equations.md leads from an equation to both.
+The page's section "From a rule to the code" leads from an equation to both.
 
 Throughout, ``slot`` is the number of a slot, ``self_index`` and ``k`` are ids - 1, ``step`` is a control instant within
 a slot, ``rules`` is what all agree on, ``memory`` and ``table`` are those of the agent that acts. Positions are m,

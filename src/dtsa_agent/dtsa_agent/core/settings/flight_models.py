@@ -1,6 +1,6 @@
 """Named flight models: how an agent avoids the others, how its vehicle answers, what room a swarm needs.
 
-Formulas and the reasons for the values: ``docs/reference/avoiders.md``.
+Formulas and the reasons for the values: ``docs/reference/settings.md``.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 /* Where to fly: collision avoidance in one step for one agent. Pure functions: no allocation, no
- * I/O. Formulas and defaults: docs/reference/avoiders.md. */
+ * I/O. Formulas and defaults: docs/reference/settings.md. */
 #ifndef DTSA_AVOIDER_H
 #define DTSA_AVOIDER_H
 

@@ -99,7 +99,7 @@ enum {
 };
 
 /* Parameters of all avoiders; which fields count depends on the avoider. Formulas and defaults:
- * docs/reference/avoiders.md. All are doubles, so that bindings can read them as a list. */
+ * docs/reference/settings.md. All are doubles, so that bindings can read them as a list. */
 typedef struct dtsa_avoid_params {
     double v_max;       /* m/s, largest commanded speed */
     double gain;        /* 1/s, K_P: v_pref = min(v_max, gain * distance) towards the goal */

@@ -1,6 +1,6 @@
 """Policy ``lease``: only the owner of a turn gives it away.
 
-Rules and events: docs/reference/protocol.md; proof: docs/explanation/lease.md.
+Rules and events: docs/reference/protocol.md; proof: docs/explanation/policies.md.
 
 * :mod:`.memory`: what an agent remembers, and what that says about a turn
 * :mod:`.decide`: who sends in a slot

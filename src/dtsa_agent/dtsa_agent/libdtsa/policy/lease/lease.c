@@ -3,7 +3,7 @@
  * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its
  * next main anchor; an agent that was given it may hand it on in the same way. So the sender in a
  * turn is its owner or the last one that was named for it. docs/reference/protocol.md has states
- * and events, docs/explanation/lease.md the proof.
+ * and events, docs/explanation/policies.md the proof.
  */
 #include <string.h>
 
