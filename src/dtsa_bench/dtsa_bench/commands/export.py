@@ -30,6 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export the bag."""
+    import pyarrow  # noqa: F401  # if it is missing, that is said before a bag is read
+
     from dtsa_bench.log.bag.metadata import bag_of
     from dtsa_bench.log.merged_bag import open_log
     from dtsa_bench.log.tables import export
