@@ -66,7 +66,7 @@ def test_what_is_in_the_wheel_and_in_the_source(wheel: Path) -> None:
         points = configparser.ConfigParser()
         points.read_string(file.read(f"dtsa-{version}.dist-info/entry_points.txt").decode())
     assert list(points["console_scripts"]) == ["dtsa"]
-    assert len(points["dtsa.policies"]) == 14
+    assert len(points["dtsa.policies"]) == 15
     assert len(points["dtsa.nodes"]) == 8
     assert said["License-Expression"] == "Apache-2.0"
     notices = {name.rpartition("/")[2] for name in names if name.startswith(f"dtsa-{version}.dist-info/licenses/")}
