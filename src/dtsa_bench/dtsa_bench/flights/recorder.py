@@ -32,7 +32,7 @@ from dtsa_channel_sim.ros.run_topics import RunState, configuration_message
 from .slot_messages import SlotMessages
 
 _VIEW_NS = 50_000_000  # simulated time from one picture of the swarm to the next
-_WAIT_NS = 1_000_000_000  # for so long the record of a slot in real time waits for reports that are late
+_WAIT_NS = 10_000_000_000  # for reports of agents that are not lost: a channel that stood still gets them late
 _DECIDED = {"chosen": np.uint16, "reason": np.uint8, "digest": np.uint32, "score": np.float64}
 _VECTORS = ("velocity", "command", "goal")
 
@@ -75,11 +75,11 @@ class FlightRecorder(ChannelObserver):
         """Simulated time at which a slot starts, ns."""
         return names.slot_time_ns(slot, self._slot_ns)
 
-    def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
+    def frame_sent(self, slot: int, data: bytes, time_ns: int, is_late: bool) -> None:
         if self._accounts is not None:
             message = deserialize_message(data, Frame)
             start_ns = ns_of(message.header.stamp) - names.TIME_ZERO_NS
-            self._accounts.add_frame(message.slot, message.agent, bytes(message.data), start_ns)
+            self._accounts.add_frame(message.slot, message.agent, bytes(message.data), start_ns, is_late)
 
     def report(self, message: Fields, data: bytes) -> None:
         if self._accounts is not None:
@@ -205,10 +205,13 @@ class RealtimeAccounts:
             self._open[slot] = _Account(self._agents, self._steps)
         return self._open[slot]
 
-    def add_frame(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
-        """A frame goes on the air."""
+    def add_frame(self, slot: int, sender: int, data: bytes, start_ns: int, is_late: bool) -> None:
+        """A frame goes on the air; one that is too late for it is received by nobody."""
         frame = _Frame(data, start_ns)
-        self._unjudged.setdefault(sender, deque()).append(frame)
+        if is_late:
+            frame.verdict = np.zeros(self._agents, np.bool_), 0, 0
+        else:
+            self._unjudged.setdefault(sender, deque()).append(frame)
         account = self._account(slot)
         if account is not None:
             account.frames.setdefault(sender, frame)

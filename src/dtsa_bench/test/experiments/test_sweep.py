@@ -220,7 +220,7 @@ def test_the_command_writes_everything(tmp_path: Path, capsys: pytest.CaptureFix
     assert "<svg" in (out / "report.html").read_text()
     # In the colours of the page, so that a dark one has light lines; files of their own keep theirs.
     assert "var(--ink)" in (out / "report.html").read_text()
-    assert INK not in (out / "report.html").read_text().split("<figure>", 1)[1]
+    assert INK not in (out / "report.html").read_text().split("<figure", 1)[1]
     assert (out / "figures" / "matrix.png").read_bytes()[:4] == b"\x89PNG"
 
 

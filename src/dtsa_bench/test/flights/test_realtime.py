@@ -49,8 +49,8 @@ def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path:
     words = ("--agents", "3", "--moving", "2", "--policy", "tdma", "--processes", "1", "--mode", "realtime")
     more = ("--no-align", "--clock-offset-ns", "4000000", "--timeout-s", "1", "--no-picture")
     fly(tmp_path / "fast", *words, *more)
-    heard = load_log(tmp_path / "fast").heard
-    assert (heard.row < heard.slot).any()
+    log = load_log(tmp_path / "fast")
+    assert (log.offset_ns[log.sent] < 0).any()
     assert readable(tmp_path / "fast")
 
 
@@ -67,7 +67,7 @@ def test_seventy_agents_lose_no_message(tmp_path: Path) -> None:
     excused = set()  # those whose frame was not ready in time, or met another: only they think that it was heard
     with Bag(out / "bag") as bag:
         for _, message in bag.typed([SLOT_RECORD]):
-            bits = np.unpackbits(message.received.reshape(len(message.sender), -1), axis=1).sum(axis=1)
+            bits = np.unpackbits(message.received.reshape(len(message.sender), (agents + 7) // 8), axis=1).sum(axis=1)
             heard += int((bits > 0).sum())
             frames += len(message.sender)
             excused |= set(message.sender[bits < agents - 1].tolist())

@@ -86,7 +86,7 @@ def test_it_lasts_until_all_can_tell_and_one_that_is_too_short_says_so() -> None
         check.slot(record(slot, sender, heard, anew=slot == 100))
     assert [line.split(":")[1] for line in check.result()["missing"]] == [" check for longer"] * 3
     lease = SwarmConfig(agents=6, policy="lease", slot_ms=150.0)
-    assert lasts_s(lease) == pytest.approx((3 * 5 + 2 * 15 + 20) * 6 * 0.15)
+    assert lasts_s(lease) == pytest.approx((3 * 3 + 2 * 15 + 20) * 6 * 0.15)
     assert lasts_s(CONFIG) == 5.0
 
 
