@@ -18,6 +18,7 @@ from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
 from dtsa_agent.ros.common.wire.messages import Fields, ns_of
 from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_bench.log.arrays import PRESENT, UNRECORDED
 from dtsa_bench.log.bag.cdr import CdrBuilder, OdometryPacker
 from dtsa_bench.log.bag.metadata import RUN_ID
 from dtsa_bench.log.bag.writer import BagWriter
@@ -169,7 +170,7 @@ class _Account:
     """What is known of one slot in real time."""
 
     def __init__(self, agents: int, steps: int) -> None:
-        self.known = np.zeros(agents, np.bool_)
+        self.known, self.sent = np.zeros(agents, np.bool_), np.zeros(agents, np.bool_)  # who has reported, and sent
         kinds = _DECIDED | {"offset_ns": np.int64}
         self.decided = {name: np.zeros(agents, kind) for name, kind in kinds.items()}
         self.track = np.zeros((steps, 3, agents))
@@ -234,6 +235,7 @@ class RealtimeAccounts:
                 continue  # too late, or told twice
             account.known[at] = True
             part = slice(row * count, (row + 1) * count)
+            account.sent[at] = np.asarray(message.length)[part] > 0
             for name, values in account.decided.items():
                 values[at] = getattr(message, name)[part]
             account.track[:, :, at] = _plane(message.track, row, self._steps, count)
@@ -277,10 +279,12 @@ class RealtimeAccounts:
         frames = {agent: frame for agent, frame in sorted(account.frames.items()) if frame.verdict is not None}
         verdicts = [frame.verdict for frame in frames.values() if frame.verdict is not None]
         received = np.array([verdict[0] for verdict in verdicts]) if verdicts else None
-        heard = account.heard
+        heard, unrecorded = account.heard, account.sent.copy()
+        unrecorded[np.array(list(frames), np.intp) - 1] = False
+        presence = PRESENT + UNRECORDED * unrecorded[here] if unrecorded.any() else []
         return {
             "outcome": (COLLISION if any(v[2] for v in verdicts) else SUCCESS) if verdicts else IDLE,
-            "agent": here + 1, **{name: values[here] for name, values in account.decided.items()},
+            "agent": here + 1, "presence": presence, **{name: values[here] for name, values in account.decided.items()},
             "track": account.track[:, :, here], **{name: v[:, here] for name, v in account.vectors.items()},
             **frame_fields({agent: frame.data for agent, frame in frames.items()}, received),
             "sent_ns": [frame.start_ns - start_ns for frame in frames.values()],

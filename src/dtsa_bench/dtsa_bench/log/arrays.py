@@ -19,7 +19,7 @@ from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
 
 UNKNOWN = len(OUTCOMES)  # outcome of a slot of which not all that could have sent have told
-PRESENT, LEAVING, NEW = 1, 2, 128  # presence of an agent; NEW is added
+PRESENT, LEAVING, UNRECORDED, NEW = 1, 2, 64, 128  # presence of an agent; the last two are added
 MAX_GAPS_LISTED = 5
 
 Floats = NDArray[np.float64]
@@ -82,7 +82,7 @@ class FlightArrays:
     sent_ns: NDArray[np.int64] | None = (
         None  # (S, N) ns, with clocks of their own: start of each transmission, likewise
     )
-    presence: NDArray[np.uint8] | None = None  # (S, N) PRESENT, LEAVING, and NEW added; None: all present
+    presence: NDArray[np.uint8] | None = None  # (S, N) PRESENT or LEAVING, UNRECORDED or NEW added; None: all PRESENT
     heard: HeardFrames | None = None  # in flights of agents with clocks of their own
     first_slot: int = 0  # number that the agents gave slot 0
     merged: dict[str, Any] | None = None  # what the log was merged from; None: it was recorded as one

@@ -24,7 +24,7 @@ from dtsa_bench.runs.metrics import metrics_tables
 from dtsa_channel_sim import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .arrays import NEW, PRESENT, FlightArrays, LogBuilder
+from .arrays import NEW, PRESENT, UNRECORDED, FlightArrays, LogBuilder
 
 Changes = Mapping[int, Mapping[str, Any]]  # of the channel's settings, by the slot from which they hold
 
@@ -148,6 +148,9 @@ def replay_log(log: FlightArrays, tags: bool) -> Iterator[tuple[int, Swarm]]:
     assert log.heard is not None
     replay = AgentReplay(config, range(1, log.agents + 1), tags)
     ends = np.searchsorted(log.heard.row, np.arange(len(log) + 1)).tolist()
+    silent = log.length == 0
+    if log.presence is not None:
+        silent &= (log.presence & UNRECORDED) == 0
     for row in range(len(log)):
         if not log.known[row].all():
             return
@@ -159,7 +162,7 @@ def replay_log(log: FlightArrays, tags: bool) -> Iterator[tuple[int, Swarm]]:
             HeardBy(int(log.heard.slot[k]), log.heard.data[k], log.heard.by[k].view(np.uint8))
             for k in range(ends[row], ends[row + 1])
         ]
-        replay.complete(np.flatnonzero(log.length[row] == 0).tolist(), heard)
+        replay.complete(np.flatnonzero(silent[row]).tolist(), heard)
 
 
 def _leaves(config: SwarmConfig, log: FlightArrays, row: int, column: int) -> bool:

@@ -106,10 +106,11 @@ class RealtimeCheck:
         """Whether the frames keep to the rules; those that came too late to be sent were made all the same."""
         log, judge = self._log, Judge(self.run.swarm)
         ids = np.arange(1, log.agents + 1)
-        unsent = log.known & (log.chosen == ids) & (log.length == 0)
+        unsent = log.known & (log.chosen == ids)
         slots: dict[int, dict[int, bytes]] = {}
         for sent in self.frames.all():
             slots.setdefault(sent.slot, {})[sent.sender] = sent.data
+            unsent[sent.slot, sent.sender - 1] = False
         for row in range(len(log)):
             if row in slots or unsent[row].any():
                 judge.slot(row, slots.get(row, {}), unrecorded=ids[unsent[row]].tolist())
