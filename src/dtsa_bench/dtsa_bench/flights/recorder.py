@@ -76,11 +76,11 @@ class FlightRecorder(ChannelObserver):
         """Simulated time at which a slot starts, ns."""
         return names.slot_time_ns(slot, self._slot_ns)
 
-    def frame_sent(self, slot: int, data: bytes, time_ns: int, is_late: bool) -> None:
+    def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
         if self._accounts is not None:
             message = deserialize_message(data, Frame)
             start_ns = ns_of(message.header.stamp) - names.TIME_ZERO_NS
-            self._accounts.add_frame(message.slot, message.agent, bytes(message.data), start_ns, is_late)
+            self._accounts.add_frame(message.slot, message.agent, bytes(message.data), start_ns)
 
     def report(self, message: Fields, data: bytes) -> None:
         if self._accounts is not None:
@@ -206,13 +206,10 @@ class RealtimeAccounts:
             self._open[slot] = _Account(self._agents, self._steps)
         return self._open[slot]
 
-    def add_frame(self, slot: int, sender: int, data: bytes, start_ns: int, is_late: bool) -> None:
-        """A frame goes on the air; one that is too late for it is received by nobody."""
+    def add_frame(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
+        """A frame goes on the air."""
         frame = _Frame(data, start_ns)
-        if is_late:
-            frame.verdict = np.zeros(self._agents, np.bool_), 0, 0
-        else:
-            self._unjudged.setdefault(sender, deque()).append(frame)
+        self._unjudged.setdefault(sender, deque()).append(frame)
         account = self._account(slot)
         if account is not None:
             account.frames.setdefault(sender, frame)

@@ -79,9 +79,7 @@ class FlightArrays:
     velocity: Floats  # (S, 3, N) m/s, at the slot's start
     command: Floats  # (S, 3, N) m/s, commanded, at the slot's start
     goal: Floats  # (S, 3, N) m
-    sent_ns: NDArray[np.int64] | None = (
-        None  # (S, N) ns, with clocks of their own: start of each transmission, likewise
-    )
+    sent_ns: NDArray[np.int64] | None = None  # (S, N) ns, with clocks of their own: start of transmissions, likewise
     presence: NDArray[np.uint8] | None = None  # (S, N) PRESENT or LEAVING, UNRECORDED or NEW added; None: all PRESENT
     heard: HeardFrames | None = None  # in flights of agents with clocks of their own
     first_slot: int = 0  # number that the agents gave slot 0

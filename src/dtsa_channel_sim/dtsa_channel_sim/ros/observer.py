@@ -45,11 +45,8 @@ class ChannelObserver:
     def answer_received(self, slot: int, ids: bytes, data: bytes) -> None:
         """A usable transmission message of these agents has come in, an answer to this slot."""
 
-    def frame_sent(self, slot: int, data: bytes, time_ns: int, is_late: bool) -> None:
-        """A usable frame message has come in, in real time only; its transmission starts at ``time_ns``.
-
-        :param is_late: it came too late, and is not on the air.
-        """
+    def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
+        """A usable frame message has come in, in real time only; its transmission starts at ``time_ns``."""
 
     def report(self, message: Fields, data: bytes) -> None:
         """A usable report has come in, in real time only; it may be of slots that are over."""

@@ -367,12 +367,11 @@ class RealtimeChannel(RosChannel):
         key = (slot, agent)
         if key in self.air.frames:
             return
-        if not self.air.hand_over(key, start_ns, bytes(message.data)):  # too late: no agent hears it
-            self._observers.frame_sent(slot, data, names.TIME_ZERO_NS + max(0, start_ns), True)
-            return
+        if not self.air.hand_over(key, start_ns, bytes(message.data)):
+            return  # too late: no agent hears it
         if slot > self.slot:
             self.accounts[slot].frames[agent] = bytes(message.data)
-        self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, start_ns), False)
+        self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, start_ns))
         self._attendance.hear((agent,), now)
 
     def _settle(self, now: int) -> None:

@@ -85,10 +85,7 @@ class FramesOnAir:
         frames = log.sent_frames
         numbers = (frames.row, frames.sender, frames.lost, frames.collided)
         columns = zip(*(values.tolist() for values in numbers), frames.data, strict=True)
-        all_in_reach = not (config.range_m or config.partition)
         for k, (row, sender, lost, collided, data) in enumerate(columns):
-            if own_clocks and all_in_reach and not (lost or collided or frames.received[k].any()):
-                continue  # it came to the channel too late, and never was on the air
             start_ns = row * log.slot_ns + (0 if log.sent_ns is None else int(log.sent_ns[row, sender - 1]))
             found.add(row, sender, start_ns, data, frames.received[k], lost, collided)
         if own_clocks and config.airtime.line.serial:
