@@ -68,7 +68,7 @@ class PositionSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class MeasuredPose:
     """A pose of motion capture that is believed."""
 
     position: Vector  # m, world
@@ -96,13 +96,13 @@ class Tracker:
     settings: PositionSettings
     origin: Vector
     room: Room | None
-    last: Seen | None = None
+    last: MeasuredPose | None = None
     refused: Counter[str] = field(default_factory=Counter)
     reason: str = ""  # why the last one was refused; empty: it was not
     sent: int = 0
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=500))  # s, from the stamp to the packet
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=512))
-    _elsewhere: tuple[Seen, int] | None = None  # the last of poses that were refused but agree, and how many there are
+    _elsewhere: tuple[MeasuredPose, int] | None = None  # the last of poses that were refused but agree; their number
     _least_lag: float = math.inf  # s, from the stamp to the arrival, of the fastest one; two clocks: of any size
     _next_send: float = -math.inf
 
@@ -136,7 +136,7 @@ class Tracker:
 
     def _plausible(
         self, position: Vector, orientation: Quaternion, frame: str, stamp: float, now: float, *, flying: bool
-    ) -> Seen:
+    ) -> MeasuredPose:
         if frame not in ("", "world", "map"):
             raise Refused("frame", f"frame_id {frame!r:.40} is neither world nor map")
         if not all(math.isfinite(v) for v in (*position, *orientation)):
@@ -146,16 +146,16 @@ class Tracker:
             raise Refused("outside", outside)
         norm = math.sqrt(sum(c * c for c in orientation))
         if self.settings.send != EXTPOSE:
-            return Seen(place, None, stamp, now)
+            return MeasuredPose(place, None, stamp, now)
         if abs(norm - 1.0) > NORM_TOLERANCE:
             raise Refused("quaternion", f"the quaternion has length {norm:.3g}, not 1 (send: extpos needs none)")
         x, y, z, w = (c / norm for c in orientation)
         tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
         if flying and tilt > TILT_RAD:
             raise Refused("attitude", f"it is tilted by {math.degrees(tilt):.0f} degrees in flight")
-        return Seen(place, (x, y, z, w), stamp, now)
+        return MeasuredPose(place, (x, y, z, w), stamp, now)
 
-    def _check_follows(self, last: Seen, seen: Seen, *, flying: bool) -> None:
+    def _check_follows(self, last: MeasuredPose, seen: MeasuredPose, *, flying: bool) -> None:
         """Whether a pose can follow the one before.
 
         :raises Refused: it cannot.
@@ -177,7 +177,7 @@ class Tracker:
             if turn > TURN_RAD + FASTEST_RADPS * passed:
                 raise Refused("attitude", f"it turns by {math.degrees(turn):.0f} degrees within {passed:.2f} s")
 
-    def _agrees_elsewhere(self, seen: Seen) -> bool:
+    def _agrees_elsewhere(self, seen: MeasuredPose) -> bool:
         """Whether enough poses agree on another place, or another time, than the last one that was believed."""
         before, count = self._elsewhere or (seen, 0)
         agrees = math.dist(before.position, seen.position) <= self.settings.jump_m
@@ -195,7 +195,7 @@ class Tracker:
         self._next_send = max(self._next_send, now - 0.9 * period) + period
         return True
 
-    def was_sent(self, seen: Seen, wall: float) -> None:
+    def was_sent(self, seen: MeasuredPose, wall: float) -> None:
         """A pose has gone to its Crazyflie at a Unix time (s)."""
         self.sent += 1
         if seen.stamp:

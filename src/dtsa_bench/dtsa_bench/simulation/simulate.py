@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,14 +97,13 @@ def simulate(
     swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared))
     writer = SlotWriter(swarm, observer, frames) if log else None
     metrics = FlightMetrics(run, scenario)
-    heard: list[_Heard] | None = None
+    heard: HeardFrames | None = None
     if run.swarm.policy_row.unslotted:
         heard = _fly_unslotted(swarm, Channel(run.air), metrics, writer)
     else:
         _fly(swarm, Channel(run.air), metrics, writer)
     arrays = None if writer is None else writer.finish()
-    flight = Flight(run, scenario, metrics, swarm, arrays, time.perf_counter() - begun)
-    return flight if heard is None or not log else replace(flight, heard=_heard_frames(heard, run.swarm.agents))
+    return Flight(run, scenario, metrics, swarm, arrays, time.perf_counter() - begun, heard)
 
 
 def complete_slot(
@@ -157,26 +156,12 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
     metrics.count_frames(length, metrics.kernel.frames)
 
 
-class _Heard(NamedTuple):
-    """A frame that agents took in."""
-
-    row: int  # in which slot
-    slot: int  # as one of which it was taken in
-    data: bytes
-    by: NDArray[np.bool_]  # (N,)
-
-
-def _heard_frames(heard: list[_Heard], agents: int) -> HeardFrames:
-    row, slot = (np.array([entry[k] for entry in heard], np.int64) for k in (0, 1))
-    by = np.array([entry.by for entry in heard], np.bool_).reshape(len(heard), agents)
-    none = np.zeros(len(heard), np.int64)
-    return HeardFrames(row, none, slot, none, by, none.astype(np.bool_), [entry.data for entry in heard])
-
-
-def _fly_unslotted(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None) -> list[_Heard]:
+def _fly_unslotted(
+    swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None
+) -> HeardFrames | None:
     """The same for agents that send at any instant: what arrives in a slot is heard in it; with a log: what was."""
     traffic = UnslottedTraffic(swarm, channel)
-    heard: list[_Heard] = []
+    heard: list[tuple[int, int, bytes, NDArray[np.bool_]]] = []  # row and slot, data, by, as in HeardFrames
     slot, over = 0, ""
     while not over:
         swarm.scenario.advance(slot, swarm)
@@ -189,11 +174,16 @@ def _fly_unslotted(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: 
         for at, frame, mask in (*arrived, *carried.combined):
             swarm.hear(at, frame, mask)
             if log is not None:
-                heard.append(_Heard(slot, at, frame, mask))
+                heard.append((slot, at, frame, mask))
         swarm.end(slot)
         over = metrics.update(slot, swarm.track, swarm, carried.outcome, carried.lengths)
         if log is not None:
             nothing = (0,) * len(carried.senders)
             log.close_slot(slot, Verdict(carried.outcome, carried.senders, None, nothing, nothing))
         slot += 1
-    return heard
+    if log is None:
+        return None
+    row, taken_as = (np.array([entry[k] for entry in heard], np.int64) for k in (0, 1))
+    by = np.array([mask for *_, mask in heard], np.bool_).reshape(len(heard), len(swarm.ids))
+    none = np.zeros(len(heard), np.int64)
+    return HeardFrames(row, none, taken_as, none, by, none.astype(np.bool_), [data for _, _, data, _ in heard])
