@@ -35,11 +35,11 @@ def run(args: argparse.Namespace) -> int:
     """Merge, and print what came of it."""
     from dtsa_bench.log.agent_bag import read_all
     from dtsa_bench.log.merge.merge import Merge, clocks_apart, verified
-    from dtsa_bench.runs.options import number
+    from dtsa_bench.runs.options import check_free, number
 
     out = Path(args.out) if args.out else None
     if out is not None:
-        from dtsa_bench.log.merged_bag import align, check_free, write_merged
+        from dtsa_bench.log.merged_bag import align, write_merged
 
         check_free(out)
     air_ns = round(number(args.air_us, "air_us", 0, 1e6, "us") * 1e3)

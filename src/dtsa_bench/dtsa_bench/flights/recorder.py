@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dtsa_msgs.msg import Frame, RunStatus
+from dtsa_msgs.msg import RunStatus
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterType
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
-from dtsa_agent.ros.common.wire.messages import Fields, ns_of
+from dtsa_agent.ros.common.wire.messages import Fields
 from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_bench.log.arrays import PRESENT, UNRECORDED
 from dtsa_bench.log.bag.cdr import CdrBuilder, OdometryPacker
@@ -76,13 +76,11 @@ class FlightRecorder(ChannelObserver):
         """Simulated time at which a slot starts, ns."""
         return names.slot_time_ns(slot, self._slot_ns)
 
-    def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
+    def frame_sent(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
         if self._accounts is not None:
-            message = deserialize_message(data, Frame)
-            start_ns = ns_of(message.header.stamp) - names.TIME_ZERO_NS
-            self._accounts.add_frame(message.slot, message.agent, bytes(message.data), start_ns)
+            self._accounts.add_frame(slot, sender, data, start_ns)
 
-    def report(self, message: Fields, data: bytes) -> None:
+    def report(self, message: Fields) -> None:
         if self._accounts is not None:
             self._accounts.add_report(message)
 

@@ -133,7 +133,7 @@ class ClockStatistics(ChannelObserver):
         self._last_spreads: deque[float] = deque(maxlen=_END)  # ns
         self._away: dict[int, _Sends] = {}  # by agent
 
-    def report(self, message: Fields, data: bytes) -> None:
+    def report(self, message: Fields) -> None:
         self.add(message.slot, message.agent, message.offset_ns, message.length)
 
     def add(

@@ -44,9 +44,10 @@ from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RUN_ID
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.runs.options import check_free
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
-from .agent_bag import AgentBag, find_bags, read_all
+from .agent_bag import find_bags, read_all
 from .merge.joined import AgentBag, run_of
 from .merge.merge import Merge, clocks_apart, sent_of
 from .merge.merged_flight import FrameOfOther, MergedFlight, from_log
@@ -258,15 +259,6 @@ def _settings(config: SwarmConfig) -> dict[str, Any]:
 
 
 # -- as a bag --------------------------------------------------------------------------------------------------------
-def check_free(directory: Path) -> None:
-    """Whether a flight can be written there.
-
-    :raises ConfigError: if something is there already.
-    """
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise ConfigError("out", str(directory), "a directory that is empty or does not exist yet")
-
-
 def write_merged(directory: Path, flight: MergedFlight, summary: Mapping[str, Any]) -> Path:
     """Write `bag` and `summary.json`, as flights leave them, whole or not at all; return the bag.
 

@@ -159,15 +159,23 @@ def named_values(words: Iterable[str]) -> dict[str, Any]:
     return values
 
 
+def check_free(directory: Path) -> None:
+    """Whether results can be put there: it does not exist yet, or is an empty directory.
+
+    :raises ConfigError: if it is in use.
+    """
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise ConfigError("out", str(directory), "a directory that is empty or does not exist yet")
+
+
 def new_directory(path: str | Path) -> Path:
-    """The directory for results: it does not exist yet, or is empty.
+    """The directory for results, which does not exist yet, or is empty.
 
     :raises ConfigError: if it is in use or cannot be made.
     """
     directory = Path(path)
     try:
-        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-            raise ConfigError("out", str(path), "a directory that is empty or does not exist yet")
+        check_free(directory)
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError("out", str(path), f"a directory that can be written to ({error.strerror})") from None

@@ -115,12 +115,9 @@ class LockstepChannel(RosChannel):
                 return False  # an answer that was asked for twice
             if message.slot > slot:
                 raise Unusable(SLOT, f"{named(message.agent)} answered slot {message.slot}, which has not begun")
-            fresh = self.answers.add(message)
+            return self.answers.add(message)
         except Unusable as error:
             self.intake.drop(error.reason, str(error))
             if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent of this run sent it
                 self._complaint, self._complaint_time = str(error), time.monotonic()
             return False
-        if fresh:
-            self._observers.answer_received(slot, message.agent.tobytes(), data)
-        return fresh

@@ -35,20 +35,21 @@ class ChannelObserver:
     """Events of a run. An observer derives from this class and overrides those that it needs; the rest costs nothing.
 
     Observers are called in the order in which they were added. None of them can change what happens on the air. A slot
-    passes in this order: ``slot_published`` and ``answer_received`` as messages go out and come in, ``all_answered``,
-    ``judged``, ``slot_over``. Answers are valid during the call. Messages are CDR, times ns of simulated time.
+    passes in this order: ``slot_published``, ``all_answered``, ``judged``, ``slot_over``. Answers are valid during the
+    call. Slot messages are CDR, their times ns of simulated time.
     """
 
     def slot_published(self, slot: int, data: bytes, time_ns: int) -> None:
         """A slot message has been sent, which opens this slot or delivers its frame."""
 
-    def answer_received(self, slot: int, ids: bytes, data: bytes) -> None:
-        """A usable transmission message of these agents has come in, an answer to this slot."""
+    def frame_sent(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
+        """A frame goes on the air, in real time only.
 
-    def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
-        """A usable frame message has come in, in real time only; its transmission starts at ``time_ns``."""
+        :param slot: that the sender counts.
+        :param start_ns: of its transmission, from the start of slot 0.
+        """
 
-    def report(self, message: Fields, data: bytes) -> None:
+    def report(self, message: Fields) -> None:
         """A usable report has come in, in real time only; it may be of slots that are over."""
 
     def begun(self, at_s: float) -> None:

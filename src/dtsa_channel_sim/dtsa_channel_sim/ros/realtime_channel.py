@@ -367,11 +367,12 @@ class RealtimeChannel(RosChannel):
         key = (slot, agent)
         if key in self.air.frames:
             return
-        if not self.air.hand_over(key, start_ns, bytes(message.data)):
+        frame = bytes(message.data)
+        if not self.air.hand_over(key, start_ns, frame):
             return  # too late: no agent hears it
         if slot > self.slot:
-            self.accounts[slot].frames[agent] = bytes(message.data)
-        self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, start_ns))
+            self.accounts[slot].frames[agent] = frame
+        self._observers.frame_sent(slot, agent, frame, start_ns)
         self._attendance.hear((agent,), now)
 
     def _settle(self, now: int) -> None:
@@ -402,10 +403,10 @@ class RealtimeChannel(RosChannel):
             if data is None:
                 return False
             with self.intake.guard():
-                self._accept_report(self._decoded(data, Report, read_report), data)
+                self._accept_report(self._decoded(data, Report, read_report))
         return True
 
-    def _accept_report(self, message: Fields, data: bytes) -> None:
+    def _accept_report(self, message: Fields) -> None:
         """Add one process's report to the accounts.
 
         :raises Unusable: if it cannot be one.
@@ -418,7 +419,7 @@ class RealtimeChannel(RosChannel):
             return  # an answer to a call, which has come late
         self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
         self._attendance.hear(message.agent, now)
-        self._observers.report(message, data)
+        self._observers.report(message)
 
     def _due(self, now: int) -> bool:
         """Whether the next slot can be closed: its frames are settled, all agents have reported for the one after."""
