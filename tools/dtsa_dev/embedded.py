@@ -174,6 +174,15 @@ def fly_app_on_cortex(directory: Path, slots: int = 200, sample: bool = False) -
     return costs
 
 
+def check_board_program(directory: Path) -> None:
+    """Compile ``board_cost.c`` by this machine's compiler, without code.
+
+    :raises DtsaError: what is wrong with it.
+    """
+    flags = ["-std=gnu11", "-DSLOTS=1", "-fsyntax-only", "-Werror", *_app_folders()]
+    compile_program(tool("gcc", "gcc"), directory / "none", [HERE / "board_cost.c"], flags, links=())
+
+
 def fused(directory: Path, library: Path = LIBRARY) -> dict[str, int]:
     """Fused multiplications and additions where a firmware's flags allow them, by file that has any."""
     counts = {}

@@ -8,7 +8,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from dtsa_dev.embedded import FUSING, STACK_BYTES, fly_app_on_cortex, fly_here, fly_on_cortex, fused
+from dtsa_dev.embedded import (
+    FUSING,
+    STACK_BYTES,
+    check_board_program,
+    fly_app_on_cortex,
+    fly_here,
+    fly_on_cortex,
+    fused,
+)
 from dtsa_dev.proofs.fuzz import Found, build, fuzz
 from dtsa_dev.proofs.library import LIBRARY, NotHere
 from dtsa_dev.prove import MUTANTS, World, explore
@@ -57,6 +65,11 @@ def test_a_microcontroller_flies_the_same_bits(tmp_path: Path) -> None:
     assert [flight.digest for flight in cortex] == [flight.digest for flight in here]
     assert len({flight.digest for flight in here}) == 6
     assert all(flight.memory < 8192 for flight in cortex)
+
+
+def test_what_measures_the_app_on_board_compiles(tmp_path: Path) -> None:
+    """On this machine, too, which has no compiler for microcontrollers."""
+    check_board_program(tmp_path)
 
 
 def test_a_slot_of_the_app_on_board_fits_its_stack_and_its_time(tmp_path: Path) -> None:

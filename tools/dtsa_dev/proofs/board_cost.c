@@ -1,6 +1,6 @@
 /* What the app on board costs: onboard/app.c runs as it is, on board mps2-an386 (see mps2.c), among
- * others that run board.c. The firmware's functions are here: they hand over what the air carries,
- * let time pass, and count instructions and stack of each turn of the app's loop.
+ * others that run the same station. The firmware's functions are here: they hand over what the air
+ * carries, let time pass, and count instructions and stack of each turn of the app's loop.
  *
  * Times are us. A turn begins where the app looks for a packet of the ground. */
 #include <setjmp.h>
@@ -14,7 +14,7 @@ enum {
     TURN_US = 20,     /* from one turn of the loop to the next while it waits awake */
     FLIGHT_US = 1500, /* from the order to send to the arrival */
     OVERLAP_US = 500, /* frames that begin so close to each other are lost */
-    OTHERS = BOARD_AGENTS - 1,
+    OTHERS = AGENTS_MAX - 1,
     WORDS = 2048,
     PAINT = 0x5a5a5a5a
 };
@@ -36,16 +36,24 @@ static uint32_t slot_sum;
 static cost turns[KINDS], slots, idle;
 static jmp_buf over;
 
-static board others[OTHERS];
-static double place_of[BOARD_AGENTS][3], speed_of[BOARD_AGENTS][3];
-static int64_t moved_slot[OTHERS];
+/* The others: agent and station each, and whether they begin together with the app's agent. */
+static struct {
+    dtsa_config config;
+    dtsa_agent *agent;
+    dtsa_station *station;
+    int64_t moved_slot;
+    int awaits_begin;
+    double agent_memory[AGENT_BYTES / sizeof(double)],
+        station_memory[STATION_BYTES / sizeof(double)];
+} others[OTHERS];
+static double place_of[AGENTS_MAX][3], speed_of[AGENTS_MAX][3];
 
 /* ---- the air: one frame at a time, in flight ---- */
 
 static struct {
     uint64_t start;
     int from, length, lost, there;
-    uint8_t data[BOARD_DATAGRAM];
+    uint8_t data[DTSA_FRAME_MAX];
 } in_flight;
 
 static reception received[4];
@@ -72,7 +80,7 @@ static void arrive(void)
     for (int k = 0; k < agents && !in_flight.lost; k++) {
         if (k == in_flight.from || draw_uniform(77, drawn++) < LOSS) continue;
         if (k > 0) {
-            board_hear(&others[k - 1], in_flight.data, in_flight.length, (int64_t)clock_us * 1000);
+            dtsa_station_receive(others[k - 1].station, in_flight.data, in_flight.length, now_ns());
         } else if (waiting < 4) {
             received[waiting].us = clock_us;
             received[waiting].length = (uint8_t)in_flight.length;
@@ -81,19 +89,45 @@ static void arrive(void)
     }
 }
 
+/* Agent and station of the k-th of the swarm; begins_ns as in app.c. */
+static void start_other(int k, int which, int64_t begins_ns)
+{
+    const dtsa_station_settings settings = station_settings(k + 1, begins_ns);
+    others[k - 1].config = config;
+    others[k - 1].config.policy = which;
+    others[k - 1].agent =
+        dtsa_agent_start(others[k - 1].agent_memory, AGENT_BYTES, &others[k - 1].config, k + 1);
+    if (!others[k - 1].agent) exit(3);
+    const dtsa_station_agent ours = dtsa_station_agent_of(others[k - 1].agent);
+    others[k - 1].station =
+        dtsa_station_start(others[k - 1].station_memory, STATION_BYTES, &settings, &ours, now_ns());
+    if (!others[k - 1].station) exit(4);
+    others[k - 1].moved_slot = -1;
+    others[k - 1].awaits_begin = !begins_ns && beginSlot > 0;
+}
+
 /* The others, once each. */
 static void live(void)
 {
     arrive();
     for (int k = 1; k < agents; k++) {
-        board *b = &others[k - 1];
-        uint8_t datagram[BOARD_DATAGRAM];
-        int length;
-        board_step(b, (int64_t)clock_us * 1000, place_of[k], speed_of[k], datagram, &length);
-        if (length > 0) emit(k, datagram, length);
-        if (b->slot == moved_slot[k - 1]) continue;
-        moved_slot[k - 1] = b->slot;
-        board_command(b, (int64_t)clock_us * 1000, speed_of[k]);
+        uint8_t datagram[DTSA_DATAGRAM_MAX];
+        int length = 0;
+        dtsa_agent_set_state(others[k - 1].agent, place_of[k], speed_of[k]);
+        dtsa_station_step(others[k - 1].station, now_ns(), datagram, &length);
+        if (length > 0) {
+            emit(k, datagram, length);
+            dtsa_station_sent(others[k - 1].station, now_ns(), 1);
+        }
+        const int64_t slot = dtsa_station_slot(others[k - 1].station);
+        if (others[k - 1].awaits_begin && slot + 1 >= (int64_t)beginSlot)
+            start_other(k, policy, dtsa_station_slot_start(others[k - 1].station, beginSlot));
+        if (slot < 0 || slot == others[k - 1].moved_slot) continue;
+        others[k - 1].moved_slot = slot;
+        if (dtsa_station_hovers(others[k - 1].station) == DTSA_FLIES)
+            dtsa_agent_command(others[k - 1].agent, slot, 0, speed_of[k]);
+        else
+            memset(speed_of[k], 0, sizeof speed_of[k]);
         for (int i = 0; i < 3; i++) place_of[k][i] += speed_of[k][i] * (double)slotUs * 1e-6;
     }
 }
@@ -122,7 +156,7 @@ static void end_turn(void)
     while (word < stack_top && *word == PAINT) word++;
     if ((uint32_t)(stack_top - word) * 4 > deepest) deepest = (uint32_t)(stack_top - word) * 4;
     /* It counts once the app steers, by this policy. */
-    if (guard.mode != SAFETY_FLY || agent.policy >= 0) return;
+    if (guard.mode != SAFETY_FLY || awaitsBegin) return;
     if (!what) {
         add(&idle, instructions);
         return;
@@ -149,8 +183,9 @@ static int64_t slot_before;
 static void pass(uint64_t us, int until_heard)
 {
     const uint64_t end = clock_us + us;
-    if (agent.slot != slot_before) what |= DID_DECIDE;
-    slot_before = agent.slot;
+    const int64_t slot = dtsa_station_slot(station);
+    if (slot != slot_before) what |= DID_DECIDE;
+    slot_before = slot;
     end_turn();
     do {
         clock_us += TURN_US;
@@ -267,20 +302,13 @@ static void prepare(int n, int p)
         const double side = 0.8 * (k / 4 + 1), far = k < n - 2 ? -1.0 : 1.0;
         const double at[3] = {k & 1 ? side : -side, k & 2 ? 2.5 : -2.5, 0.1 * (k % 5)};
         for (int i = 0; i < 3; i++) {
-            starts[i * BOARD_AGENTS + k] = place_of[k][i] = at[i];
-            targets[i * BOARD_AGENTS + k] = i < 2 ? far * at[i] : at[i];
+            starts[i * AGENTS_MAX + k] = place_of[k][i] = at[i];
+            targets[i * AGENTS_MAX + k] = i < 2 ? far * at[i] : at[i];
             speed_of[k][i] = 0.0;
         }
     }
     obey((const uint8_t *)"S", 1);
-    for (int k = 1; k < n; k++) {
-        board_settings own = agent.settings;
-        own.id = k + 1;
-        others[k - 1].config = agent.config;
-        others[k - 1].watch = NULL;
-        moved_slot[k - 1] = -1;
-        if (board_start(&others[k - 1], &own, (int64_t)clock_us * 1000)) exit(3);
-    }
+    for (int k = 1; k < n; k++) start_other(k, config.policy, 0);
 }
 
 static void show(const cost *c)
@@ -291,10 +319,10 @@ static void show(const cost *c)
 int main(void)
 {
 #ifdef SAMPLE
-    static const int POLICIES[] = {DTSA_POLICY_LEASE}, SIZES[] = {BOARD_AGENTS};
+    static const int POLICIES[] = {DTSA_POLICY_LEASE}, SIZES[] = {AGENTS_MAX};
 #else
     static const int POLICIES[] = {DTSA_POLICY_TDMA, DTSA_POLICY_DTSA, DTSA_POLICY_LEASE};
-    static const int SIZES[] = {12, BOARD_AGENTS};
+    static const int SIZES[] = {12, AGENTS_MAX};
 #endif
     static volatile unsigned i, j;
     for (i = 0; i < sizeof POLICIES / sizeof POLICIES[0]; i++)
@@ -309,7 +337,8 @@ int main(void)
             show(&turns[DID_HEAR]), show(&turns[DID_DECIDE]);
             show(&turns[DID_SEND]), show(&turns[DID_STEER]);
             show(&slots), show(&idle);
-            printf(" %d\n", (int)agent.hearing.length);
+            const dtsa_station_settings settings = station_settings(1, 0);
+            printf(" %d\n", dtsa_datagram_length(&settings));
         }
     return 0;
 }

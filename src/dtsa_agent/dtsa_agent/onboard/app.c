@@ -1,4 +1,4 @@
-/* The protocol as an app of a Crazyflie: what is between the firmware and board.c and safety.c.
+/* The protocol as an app of a Crazyflie: what is between the firmware and the station and safety.c.
  *
  * How it is built and flown: docs/how-to/on-board.md. It was never flown on hardware.
  *
@@ -150,15 +150,12 @@ static void fly_to(int k)
     dtsa_agent_set_goal(agent, goal, goalsKnown);
 }
 
-/* Makes agent and station. begins_ns: all begin slot 0 then; 0: it listens. */
-static const char *begin(int which, int64_t begins_ns)
+/* Of the station with this id. begins_ns: all start slot 0 then; 0: it listens. */
+static dtsa_station_settings station_settings(int id, int64_t begins_ns)
 {
     static const int LENGTHS[DTSA_PROFILE_COUNT] = {19, 23, EXTENDED_LENGTH};
-    config.policy = which;
-    const char *fault = dtsa_config_fault(&config);
-    if (fault) return fault;
-    const dtsa_station_settings settings = {
-        .id = own_id,
+    return (dtsa_station_settings){
+        .id = id,
         .agents = agents,
         .anchor_every = config.lease.anchor_every,
         .main_every = config.lease.main_every,
@@ -180,6 +177,15 @@ static const char *begin(int which, int64_t begins_ns)
                  .flight_ns = (int64_t)flightUs * 1000,
                  .trust_ns = 1000000},
     };
+}
+
+/* Makes agent and station. */
+static const char *begin(int which, int64_t begins_ns)
+{
+    config.policy = which;
+    const char *fault = dtsa_config_fault(&config);
+    if (fault) return fault;
+    const dtsa_station_settings settings = station_settings(own_id, begins_ns);
     if (dtsa_datagram_length(&settings) > DTSA_FRAME_MAX) return "profile";
     agent = dtsa_agent_start(agent_memory, sizeof agent_memory, &config, own_id);
     if (!agent) return "memory";
