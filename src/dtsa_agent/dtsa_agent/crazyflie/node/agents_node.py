@@ -48,6 +48,7 @@ HOLD_MPS = 0.3
 SPREAD_M = 0.45  # horizontally: closer than this nobody comes to rest, since all land straight down
 NOWHERE_M = 1e-3
 PUSH_M = 0.3  # farther than this at once nobody makes way
+FENCE_GAIN = 1.5  # 1/s: commands towards the fence shrink with the distance; a vehicle outside is landed, and with it all
 
 
 class ExternalVehicles:
@@ -56,10 +57,15 @@ class ExternalVehicles:
     :param swarms: the agents, in one or several swarms; positions and velocities are written into them from outside.
     :param every: slots between two commands.
     :param send: takes the place of a swarm and its agents' commanded velocities, m/s, frame map.
+    :param fence: m, frame map, corners of the box that no command leads out of; None: there is none.
     """
 
-    def __init__(self, swarms: Sequence[Swarm], every: int, send: Callable[[int, NDArray[np.float64]], None]) -> None:
+    def __init__(
+        self, swarms: Sequence[Swarm], every: int, send: Callable[[int, NDArray[np.float64]], None],
+        fence: tuple[Vector, Vector] | None = None,
+    ) -> None:  # fmt: skip
         self._swarms, self._every, self._send = swarms, every, send
+        self._fence = None if fence is None else np.array(fence)[:, :, None]
         ends = np.cumsum([len(swarm.ids) for swarm in swarms]).tolist()
         self._columns = [slice(end - len(swarm.ids), end) for swarm, end in zip(swarms, ends, strict=True)]
         self._stopping = False
@@ -90,6 +96,9 @@ class ExternalVehicles:
         if still.any():
             away = (swarm.scenario.start[:, swarm.local] - swarm.position)[:, still]
             swarm.command[:, still] = np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
+        if self._fence is not None:
+            low, high = FENCE_GAIN * (self._fence - swarm.position)
+            swarm.command[:] = np.clip(swarm.command, low, high)
         self._send(index, swarm.command)
 
     def _way(self) -> NDArray[np.float64]:
@@ -112,15 +121,16 @@ class StationNode(RealtimeNode):
     :param command_hz: rate of the commands, Hz; at most one a slot.
     :param vehicles: names of the agents' vehicles.
     :param origin: m, where the vehicles' world sees the origin of `map`.
+    :param fence: of `ExternalVehicles`.
     """
 
     def __init__(
         self, node: Node, config: SwarmConfig, *args: Any, command_hz: float, vehicles: Sequence[str],
-        origin: Vector, **more: Any,
+        origin: Vector, fence: tuple[Vector, Vector] | None, **more: Any,
     ) -> None:  # fmt: skip
         super().__init__(node, config, *args, **more)
         every, swarms = max(1, round(1.0 / command_hz / config.slot_s)), [agent.swarm for agent in self.agents]
-        self._vehicles, count = ExternalVehicles(swarms, every, self._command), len(swarms)
+        self._vehicles, count = ExternalVehicles(swarms, every, self._command, fence), len(swarms)
         self._names, self._origin = vehicles, origin
         self._heard = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
@@ -201,6 +211,9 @@ class StationNodeSettings(Settings):
     priority: int = setting(0, "real-time priority; 0: none", minimum=0, maximum=90)
     vehicles: str = setting("", "names of the vehicles of all agents, with blanks between; empty: cf1, cf2, ...")
     origin: Vector = setting((0.0, 0.0, 0.0), "where the vehicles' world sees the origin of map", unit="m")
+    fence: bool = setting(False, "give no command that leads out of the box between fence_min and fence_max")
+    fence_min: Vector = setting((-1.5, -2.3, -0.95), "lower corner of the box, frame map", unit="m")
+    fence_max: Vector = setting((1.5, 2.3, 0.95), "upper corner of the box, frame map", unit="m")
 
 
 def _body(stop: Stop, supervised: bool) -> None:
@@ -218,6 +231,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         # One station, one clock: no offsets, and nothing to align.
         more = {"authenticator": authenticator(config), "align": False, "command_hz": station.command_hz}
         more |= {"vehicles": [vehicles[k - 1] for k in ids], "origin": station.origin}
+        more["fence"] = (station.fence_min, station.fence_max) if station.fence else None
         agents = StationNode(node, config, ids, space, **more)
         try:
             agents.run(stop)

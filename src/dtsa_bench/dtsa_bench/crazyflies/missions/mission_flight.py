@@ -125,12 +125,14 @@ class _Station:
 
     def _start_agents(self, run: RunConfig) -> None:
         settings, parameters = self.settings, self._directory / "parameters.yaml"
+        safety = settings.station.safety
         own = {
             "command_hz": float(max(robot.command_rate_hz for robot in settings.robots)),
             "priority": below(settings.station.priority, 2),
             "vehicles": " ".join(robot.name for robot in settings.robots),
             "origin": list(settings.station.room_origin_in_world),
-        }
+            "fence": safety.geofence, "fence_min": list(safety.geofence_min), "fence_max": list(safety.geofence_max),
+        }  # fmt: skip
         content = {"/**": {"ros__parameters": to_parameters(run.swarm.to_dict(), SwarmConfig) | own}}
         parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
         self.agents.start("agents", list(range(1, run.swarm.agents + 1)), "dtsa_agent.crazyflie.node.agents_node",
