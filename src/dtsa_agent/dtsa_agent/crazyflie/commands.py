@@ -129,7 +129,7 @@ class CommandInput:
             self._warn(f"{self._name}: {error}")
             return
         if not self._controls.command(setpoint):
-            self._warn(f"{self._name}: commands are not accepted now ({self._controls.standing})")
+            self._warn(f"{self._name}: commands are not accepted now ({self._controls.state_text})")
 
 
 class CommandThread:

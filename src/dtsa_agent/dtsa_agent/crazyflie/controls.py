@@ -30,8 +30,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from .commands import Setpoint, velocity_world
-from .link import Link, Send
-from .settings import StationSettings
+from .link import CrazyflieLink, Send
+from .settings import GroundStationSettings
 from .state import State, StateMachine, Vector
 
 PEAK = 35 / 16  # largest over mean speed of such a polynomial, at its middle
@@ -74,7 +74,7 @@ def too_short(duration: float, distance: float, limit: float) -> str:
     )
 
 
-def landing_s(distance: float, wanted: float, station: StationSettings) -> float:
+def landing_s(distance: float, wanted: float, station: GroundStationSettings) -> float:
     """Duration (s) of a landing over a distance (m): as wanted (0: at the station's speed), or longer if too short."""
     seconds = wanted if wanted > 0.0 else max(MIN_LAND_S, abs(distance) / station.land_speed_mps)
     return max(seconds, shortest_s(distance, station.max_speed_mps))
@@ -148,7 +148,12 @@ class Controls:
     """The present stream, path, braking or landing of one Crazyflie."""
 
     def __init__(
-        self, link: Link, station: StationSettings, machine: StateMachine, lock: Any, log: Callable[[str], None]
+        self,
+        link: CrazyflieLink,
+        station: GroundStationSettings,
+        machine: StateMachine,
+        lock: Any,
+        log: Callable[[str], None],
     ) -> None:
         self._link, self._station, self._machine, self._lock, self._log = link, station, machine, lock, log
         self.moved = False  # something that makes it fly was sent since it was armed
@@ -165,7 +170,7 @@ class Controls:
         self._landings: list[float] = []  # s: when to repeat a landing that may not have been heard
 
     @property
-    def standing(self) -> str:
+    def state_text(self) -> str:
         """The vehicle's state, and why it is in it."""
         return f"{self._machine.state.name.lower()}: {self._machine.reason}"
 
@@ -263,7 +268,7 @@ class Controls:
         """It is heard: no landing is repeated."""
         self._landings.clear()
 
-    def land_again(self, height: float, now: float) -> None:
+    def repeat_due_landing(self, height: float, now: float) -> None:
         """Order the landing from a height (m) once more, when it is time."""
         if self._landings and now >= self._landings[0]:
             self._landings.pop(0)
@@ -281,11 +286,11 @@ class Controls:
         """Whether it sinks without a place."""
         return self._blind is not None and self._blind[0][2] < 0.0
 
-    def see_again(self) -> None:
+    def end_blind_flight(self) -> None:
         """Places count again."""
         self._blind = None
 
-    def stand_blindly(self, now: float) -> None:
+    def stop_blindly(self, now: float) -> None:
         """Zero velocity, whatever the estimate says."""
         self._steer_blindly(STANDSTILL, math.inf, now)
 
@@ -299,7 +304,7 @@ class Controls:
         self.delivery.cancel()
         self._link.stream(velocity_world(velocity, 0.0, now))
 
-    def go_on_blindly(self, in_air: bool, seen: Vector | None, now: float) -> None:
+    def continue_blind_flight(self, in_air: bool, seen: Vector | None, now: float) -> None:
         """The next packet of a stream that needs no place; the motors stop once the vehicle must be down.
 
         :param seen: m, world, where motion capture sees it; None: not at all.

@@ -39,7 +39,7 @@ _SET_S = 5.0  # longest wait until all parameters are confirmed
 
 
 @dataclass(frozen=True, slots=True)
-class OnBoardSettings(Settings):
+class OnboardSettings(Settings):
     """Crazyflies that steer themselves."""
 
     swarm: Mapping[str, Any] = setting(
@@ -64,7 +64,7 @@ class OnBoardSettings(Settings):
         return bool(self.swarm)
 
 
-def check_on_board(swarm: SwarmConfig) -> None:
+def check_onboard_swarm(swarm: SwarmConfig) -> None:
     """Refuses a swarm that the app cannot be.
 
     :raises ConfigError: if it cannot.
@@ -127,7 +127,7 @@ def orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[byt
     return found
 
 
-class BoardOrders:
+class OnboardSetup:
     """For one Crazyflie; called in its link's worker, on the ground.
 
     :param parameters: values of the app's parameters, `group.name`.

@@ -56,11 +56,11 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
         for swarm in (plain, outside):
             swarm.position[:, still] = plain.scenario.start[:, still] + 0.1
             swarm.begin(slot)
-        vehicles.place(plain.position)
+        vehicles.set_positions(plain.position)
         outside.velocity[:] = plain.velocity
         before = outside.position.copy()
         plain.steer(slot, 0)
-        vehicles.fly(slot)
+        vehicles.send_commands(slot)
         assert np.array_equal(outside.position, before)
         assert np.array_equal(outside.track[-1], before)
         assert len(sent) == slot // 2 + 1
@@ -89,7 +89,7 @@ def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple
     swarm.scenario.advance(0, swarm)
     place, velocity, closest = swarm.scenario.start.copy(), np.zeros((3, 12)), np.inf
     for now in range(slot + 200):
-        vehicles.place(place)
+        vehicles.set_positions(place)
         swarm.velocity[:] = velocity
         if now == slot and stop_here:
             vehicles.stop_here()
@@ -97,7 +97,7 @@ def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple
         for index in np.flatnonzero(swarm.sends):
             swarm.hear(now, swarm.frame(index))
         if now < slot or stop_here:
-            vehicles.fly(now)
+            vehicles.send_commands(now)
         elif now >= slot + 20:
             commands[:] = 0.0
         swarm.end(now)

@@ -142,10 +142,10 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("state", "code"), [(State.READY, 0), (State.LOST, 1)])
 def test_one_that_is_lost_on_the_way_down_is_named_at_the_end(state: State, code: int) -> None:
     bridge, said = MagicMock(), []
-    bridge.in_air.return_value = ["cf1", "cf2"]
+    bridge.names_in_air.return_value = ["cf1", "cf2"]
     bridge.wait_landed.return_value = []
     bridge.vehicles = {"cf1": SimpleNamespace(state=State.READY), "cf2": SimpleNamespace(state=state)}
-    node = SimpleNamespace(bridge=bridge, say=lambda level, line: said.append(line))
+    node = SimpleNamespace(bridge=bridge, log=lambda level, line: said.append(line))
     assert bridge_node._end(node, SimpleNamespace(count=1)) == code  # type: ignore[arg-type]
     assert ("not known to have landed: cf2" in said) == bool(code)
     bridge.close.assert_called_once_with()

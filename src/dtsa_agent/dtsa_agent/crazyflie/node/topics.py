@@ -27,10 +27,10 @@ from std_srvs.srv import Empty, SetBool, Trigger
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.commands import FULL_STATE, POSITION, VELOCITY_WORLD, CommandInput, CommandThread
-from dtsa_agent.crazyflie.positions import NAMED_POSES, PositionSettings, Tracker
+from dtsa_agent.crazyflie.positions import NAMED_POSES, PoseTracker, PositionSettings
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state import State, VehicleState, place_text, rotate_inverse
-from dtsa_agent.crazyflie.vehicle import OFF, Snapshot, Vehicle
+from dtsa_agent.crazyflie.vehicle import OFF, CrazyflieVehicle, Snapshot
 from dtsa_agent.ros.common.wire.packing import UNKNOWN, diagonal
 
 from . import interfaces
@@ -48,7 +48,7 @@ LOW_POWER = 3  # pm_state
 # positioning system. Body rates are not logged.
 POSE_COVARIANCE = diagonal(0.03**2, 0.1**2)
 TWIST_COVARIANCE = diagonal(0.1**2, UNKNOWN)
-Say = Callable[[str, str], None]
+LogLine = Callable[[str, str], None]
 
 
 def seconds(duration: DurationMsg) -> float:
@@ -72,14 +72,14 @@ def helper_node(node: Node, name: str) -> Node:
 
 
 # -- what comes in ----------------------------------------------------------------------------------------------------
-class Inputs:
+class BridgeInputs:
     """Streamed commands, services, the ground station's heartbeat.
 
     :param commands: reads the streamed commands; not started yet.
     """
 
-    def __init__(self, node: Node, bridge: Bridge, commands: CommandThread, say: Say) -> None:
-        self._node, self._bridge, self._commands, self._say = node, bridge, commands, say
+    def __init__(self, node: Node, bridge: Bridge, commands: CommandThread, log: LogLine) -> None:
+        self._node, self._bridge, self._commands, self._log = node, bridge, commands, log
         self._on_board = bridge.settings.station.on_board.on
         self._waiting = ReentrantCallbackGroup()  # of services that wait: the others are served meanwhile
         self._masks = {name: vehicle.robot.group_mask for name, vehicle in bridge.vehicles.items()}
@@ -92,7 +92,7 @@ class Inputs:
             (interfaces.VelocityWorld, "cmd_velocity_world", VELOCITY_WORLD),
         )
         warn = partial(self._node.get_logger().warning, throttle_duration_sec=1.0)
-        FirmwareParameters(self._node, self._bridge, self._say, self._masks).declare()
+        FirmwareParameters(self._node, self._bridge, self._log, self._masks).declare()
         for name, vehicle in self._bridge.vehicles.items():
             for message, topic, kind in () if self._on_board else streams:  # agents on board steer themselves
                 read = CommandInput(kind, vehicle.controls, vehicle.station, name, warn)
@@ -129,17 +129,19 @@ class Inputs:
         result = callback(request)
         done, text = await result if hasattr(result, "__await__") else result
         fields = ", ".join(f"{key} {_short(getattr(request, key))}" for key in request.get_fields_and_field_types())
-        self._say("info" if done else "warn", f"order /{name} ({fields}): {'done' if done else text}")
+        self._log("info" if done else "warn", f"order /{name} ({fields}): {'done' if done else text}")
         if hasattr(response, "success"):
             response.success, response.message = done, text
         return response
 
-    def _each(self, names: list[str], order: Callable[[Vehicle], str | None], group: int = 0) -> tuple[bool, str]:
+    def _each(
+        self, names: list[str], order: Callable[[CrazyflieVehicle], str | None], group: int = 0
+    ) -> tuple[bool, str]:
         """Give an order to those that are addressed (group 0: to all of them; else to those in one of these groups)."""
         members = [name for name in names if not group or self._masks[name] & group]
         if not members:
             return False, f"nobody of {', '.join(names)} is in a group of {group}"
-        return self._bridge.each(members, order)
+        return self._bridge.order_each(members, order)
 
     def _refuse(self, names: list[str], request: Any) -> tuple[bool, str]:
         return False, "trajectories are not supported: send positions, velocities or go_to"
@@ -195,7 +197,7 @@ class Inputs:
     def _emergency(self, names: list[str], request: Any) -> tuple[bool, str]:
         for name in names:
             self._bridge.vehicles[name].stop("service emergency")
-        self._say("error", f"EMERGENCY STOP of {', '.join(names)}: service")
+        self._log("error", f"EMERGENCY STOP of {', '.join(names)}: service")
         return True, ""
 
     def _reconnect(self, name: str, request: Any, response: Any) -> Any:
@@ -225,7 +227,9 @@ def named_pose_array() -> Any:
     return NamedPoseArray
 
 
-def subscribe_positions(poses: CommandThread, settings: PositionSettings, vehicles: dict[str, Vehicle]) -> None:
+def subscribe_positions(
+    poses: CommandThread, settings: PositionSettings, vehicles: dict[str, CrazyflieVehicle]
+) -> None:
     """Listen to motion capture, if there is one, in a thread that is not started yet.
 
     :raises ConfigError: the type of the named poses is not there.
@@ -239,20 +243,20 @@ def subscribe_positions(poses: CommandThread, settings: PositionSettings, vehicl
             poses.subscribe(PoseStamped, settings.topic_of(name), take, SENSOR)
 
 
-def _named(vehicles: dict[str, Vehicle], message: Any, info: Any) -> None:
+def _named(vehicles: dict[str, CrazyflieVehicle], message: Any, info: Any) -> None:
     for named in message.poses:
         if (vehicle := vehicles.get(named.name)) is not None:
             _see(vehicle, message.header, named.pose)
 
 
-def _see(vehicle: Vehicle, header: Any, pose: Any) -> None:
+def _see(vehicle: CrazyflieVehicle, header: Any, pose: Any) -> None:
     p, q = pose.position, pose.orientation
     stamp = header.stamp.sec + header.stamp.nanosec * 1e-9
-    vehicle.see((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), header.frame_id, stamp)
+    vehicle.receive_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), header.frame_id, stamp)
 
 
 # -- what goes out ----------------------------------------------------------------------------------------------------
-class Outputs:
+class BridgeOutputs:
     """Odometry, pose, status, diagnostics and events."""
 
     def __init__(self, node: Node, settings: SwarmSettings) -> None:
@@ -279,7 +283,7 @@ class Outputs:
         self._events = node.create_publisher(Log, EVENTS.lstrip("/"), EVENTS_QOS)
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
 
-    def publish_state(self, vehicle: Vehicle, state: VehicleState) -> None:
+    def publish_state(self, vehicle: CrazyflieVehicle, state: VehicleState) -> None:
         """Odometry and pose of one log packet, in the link's thread; only what somebody listens to.
 
         Whoever has entered another state says so at once: others may fly towards it.
@@ -387,7 +391,7 @@ def diagnostic(s: Snapshot, now: float) -> DiagnosticStatus:
     return DiagnosticStatus(level=level, name=name, message=s.state.name.lower(), hardware_id=s.name, values=pairs)
 
 
-def position_values(tracker: Tracker, now: float) -> dict[str, str]:
+def position_values(tracker: PoseTracker, now: float) -> dict[str, str]:
     """Return what /diagnostics says about motion capture and one vehicle."""
     refused = ", ".join(f"{kind} {number}" for kind, number in sorted(tracker.refused.items()))
     return {

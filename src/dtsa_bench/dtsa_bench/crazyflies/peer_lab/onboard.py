@@ -15,7 +15,7 @@ from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.onboard import KEY_BYTES, PORT, START, check_on_board, orders, parameters
+from dtsa_agent.crazyflie.onboard import KEY_BYTES, PORT, START, check_onboard_swarm, orders, parameters
 from dtsa_bench.log.agent_bag import AgentRecorder
 
 from .app import App, LabSettings, read_app
@@ -110,7 +110,7 @@ class OnBoard:
         enable_s: float | None = 8.0,
         flags: Sequence[str] = (),
     ) -> None:
-        check_on_board(swarm)
+        check_onboard_swarm(swarm)
         if swarm.auth and len(key) != KEY_BYTES:
             raise ConfigError("key", len(key) or "none", f"{KEY_BYTES} bytes on board")
         self.swarm, self.scenario = swarm, make_scenario(swarm)
