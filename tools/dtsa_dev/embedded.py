@@ -102,7 +102,7 @@ def _measure_library(directory: Path) -> tuple[list[str], list[list[str]], str]:
 
 def _measure_board(directory: Path) -> tuple[list[str], list[list[str]], str]:
     """What `dtsa embedded --board` shows: heads, rows, sizes."""
-    from dtsa_bench.crazyflies.simulated.radio import esb
+    from dtsa_bench.crazyflies.simulated.radio import air as esb
     from dtsa_channel_sim.model.airtime import airtime_of
 
     air = airtime_of("crazyflie", esb.BITRATES["2M"], esb.TURN_NS, 0)

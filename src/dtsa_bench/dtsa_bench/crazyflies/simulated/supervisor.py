@@ -32,7 +32,7 @@ IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
 HL_ACTIVE, HL_FINISHED = 256, 512
 
 
-class Supervisor:
+class FirmwareSupervisor:
     """State machine of one Crazyflie; `auto_arming`: a 2.1 or 2.1+, a 2.1 brushless or a Bolt waits to be armed."""
 
     def __init__(self, report: Callable[..., None], *, auto_arming: bool = False) -> None:
