@@ -74,6 +74,22 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
         plain.move(0)
 
 
+def test_no_command_leads_out_of_the_fence() -> None:
+    """Making way for others led one of twelve out, and the bridge landed all."""
+    config, sent = SwarmConfig(agents=2, moving=2, policy="tdma", seed=2), list[np.ndarray]()
+    for fence in (None, ((-0.5, -9.0, -9.0), (0.5, 9.0, 9.0))):
+        swarm = Swarm(config)
+        swarm.scenario.advance(0, swarm)
+        vehicles = ExternalVehicles([swarm], 1, lambda _, command: sent.append(command.copy()), fence)
+        vehicles.set_positions(np.array([[0.45, -0.6], [0.0, 0.0], [0.0, 0.0]]))
+        swarm.goal[:] = [[3.0, -3.0], [0.0, 0.0], [0.0, 0.0]]
+        swarm.begin(0)
+        vehicles.send_commands(0)
+    free, fenced = sent
+    assert free[0, 0] > 0.5 > 0.1 > fenced[0, 0] > 0.0  # slower, the nearer the fence
+    assert free[0, 1] < -0.5 < 0.1 < fenced[0, 1]  # outside: back
+
+
 def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple[float, float, float]:
     """Smallest distance (m) of twelve after a slot, where they stop or commands break off for 0.4 s before they brake;
 

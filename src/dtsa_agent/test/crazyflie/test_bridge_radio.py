@@ -32,10 +32,7 @@ def radio_flight(
     every = count + strangers
     data = {
         "robots": {
-            f"cf{k}": {
-                "uri": f"radio://{radio}/80/2M/E7E7E7E7{k:02X}",
-                "initial_position": [0.35 * k - 1.25, 0.0, 0.0],
-            }
+            f"cf{k}": {"uri": f"radio://{radio}/80/2M/E7E7E7E7{k:02X}", "initial_position": [0.35 * k - 1.25, 0.0, 0.0]}
             for k in range(1, every + 1)
         },
         "all": {"connect_timeout_s": 10.0, "estimator_timeout_s": 5.0},

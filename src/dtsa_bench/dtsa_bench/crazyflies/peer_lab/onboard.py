@@ -149,7 +149,7 @@ class OnboardSwarm:
             self._at(now + 0.1 + i * _ORDER_S, lab.send, agent, order)
 
     def come_back(self, agent: int, after_s: float) -> None:
-        """One that was switched off is switched on, gets its settings, and takes off; it may steer so many s from now on."""
+        """Switch one on that was off; it gets its settings and takes off, and may steer so many s from now on."""
         self.lab.switch_on(agent)
         self._at(self.lab.time + 0.5, self.prepare, agent)
         self._climb(agent, HEIGHT_M, self.lab.time + after_s)
