@@ -100,7 +100,7 @@ class BridgeInputs:
             self._create_services(name, [name])
             self._node.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
         self._commands.start()
-        self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.heartbeat(), LATEST_ONLY)
+        self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.note_heartbeat(), LATEST_ONLY)
         self._node.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
         self._create_services("all", list(self._bridge.vehicles))
 
@@ -147,7 +147,7 @@ class BridgeInputs:
         return False, "trajectories are not supported: send positions, velocities or go_to"
 
     def _takeoff(self, names: list[str], request: Any) -> tuple[bool, str]:
-        if problem := self._bridge.enough():
+        if problem := self._bridge.why_no_takeoff():
             return False, problem
         duration = seconds(request.duration)
         return self._each(names, lambda v: v.takeoff(request.height, duration), request.group_mask)
