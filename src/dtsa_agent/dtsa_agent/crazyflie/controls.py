@@ -10,8 +10,8 @@ A set-point's way from the graph to the motors, and who may stop it:
    capture does not see the vehicle (`paused`), or while a take-off or go-to is flown to its end (`guard_until`). One
    that counts ends whatever else was flown: a braking, an order that is being repeated.
 3. **The link** (`link`) gives it to cflib, whose driver (`drivers`) keeps the newest one until it can be sent.
-4. **When the stream stops.** `safety` looks at the command's age 50 times a second: :meth:`Vehicle.hold` comes first,
-   then :meth:`Vehicle.land`. Both brake by a stream of zero velocity, then give an order to the firmware's high-level
+4. **When the stream stops.** `safety` looks at the command's age 50 times a second: :meth:`hold_place` of the
+   vehicle comes first, then `land`. Both brake by a stream of zero velocity, then give an order to the firmware's high-level
    commander. The order goes out before the end of the stream, or the motors would stop for a moment.
 
 The firmware's high-level commander flies polynomials of degree 7 from rest to rest, whatever the duration. If it is too

@@ -126,8 +126,11 @@ class BridgeInputs:
 
     async def _ordered(self, name: str, callback: Callable[[Any], Any], request: Any, response: Any) -> Any:
         """Carry out an order, and say so: what an operator did belongs to what happened."""
-        result = callback(request)
-        done, text = await result if hasattr(result, "__await__") else result
+        try:
+            result = callback(request)
+            done, text = await result if hasattr(result, "__await__") else result
+        except Exception as error:  # of this order: emergency stops must still be answered
+            done, text = False, f"{type(error).__name__}: {error}"
         fields = ", ".join(f"{key} {_short(getattr(request, key))}" for key in request.get_fields_and_field_types())
         self._log("info" if done else "warn", f"order /{name} ({fields}): {'done' if done else text}")
         if hasattr(response, "success"):

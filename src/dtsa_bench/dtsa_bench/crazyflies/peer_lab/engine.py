@@ -49,11 +49,11 @@ class _Report(Structure):
 _SIGNATURES = {
     "lab_begin": (c_int, [c_int, c_int, POINTER(c_char_p), c_int, POINTER(c_char_p), c_int64, c_int64, c_int64]),
     "lab_run": (POINTER(_Report), [c_int64]),
-    "lab_world": (POINTER(c_double), [c_int]),
-    "lab_known": (POINTER(c_double), [c_int]),
+    "lab_log_values": (POINTER(c_double), [c_int]),
+    "lab_parameter_values": (POINTER(c_double), [c_int]),
     "lab_off": (None, [c_int]),
     "lab_boot": (c_char_p, [c_int, c_char_p, c_int64, c_int64, c_int64, c_uint64, c_int, c_int]),
-    "lab_hear": (c_int, [c_int, c_int64, c_char_p, c_int, c_int]),
+    "lab_receive": (c_int, [c_int, c_int64, c_char_p, c_int, c_int]),
     "lab_app_channel": (c_int, [c_int, c_int64, c_char_p, c_int]),
     "lab_count": (c_int, [c_int, c_int]),
     "lab_name": (c_char_p, [c_int, c_int, c_int]),
@@ -123,11 +123,11 @@ class Engine:
         self._run = self._library.lab_run
         #: Values of the firmware's log variables by vehicle, in the order of their names: written by the owner.
         self.firmware_logs: list[NDArray[np.float64]] = [
-            np.ctypeslib.as_array(self._library.lab_world(k), (len(names),)) for k in range(count)
+            np.ctypeslib.as_array(self._library.lab_log_values(k), (len(names),)) for k in range(count)
         ]
         #: Values of the firmware's parameters by vehicle, likewise.
         self.firmware_parameters: list[NDArray[np.float64]] = [
-            np.ctypeslib.as_array(self._library.lab_known(k), (len(parameters),)) for k in range(count)
+            np.ctypeslib.as_array(self._library.lab_parameter_values(k), (len(parameters),)) for k in range(count)
         ]
         self._variables: dict[tuple[int, int], dict[str, int]] = {}
         self._told = _Report()
@@ -163,9 +163,9 @@ class Engine:
         self._variables.pop((vehicle, 0), None)
         self._variables.pop((vehicle, 1), None)
 
-    def hear(self, vehicle: int, now_ns: int, raw: bytes, rssi: int) -> bool:
+    def receive(self, vehicle: int, now_ns: int, raw: bytes, rssi: int) -> bool:
         """A packet (port, data) has come to a vehicle's processor; False: its queue is full."""
-        return bool(self._library.lab_hear(vehicle, now_ns, raw, len(raw), rssi))
+        return bool(self._library.lab_receive(vehicle, now_ns, raw, len(raw), rssi))
 
     def app_channel(self, vehicle: int, now_ns: int, data: bytes) -> bool:
         """A packet of the app channel has come to a vehicle; False: its queue is full."""

@@ -292,7 +292,7 @@ class Laboratory:
         k = agent - 1
         if life != self._power_cycles[k]:
             return  # its power was off meanwhile
-        if self._engine.hear(k, now_ns, packet.raw, self._rssi(packet.sender, k)):
+        if self._engine.receive(k, now_ns, packet.raw, self._rssi(packet.sender, k)):
             self._handed[k].append(packet)
 
     def _rssi(self, sender: int, k: int) -> int:
