@@ -1,4 +1,4 @@
-"""What a Crazyflie's firmware is told to fly: a stream of commands, a path, a landing, or a velocity without a place.
+"""What a Crazyflie's firmware has to fly: a stream of commands, a path, a landing, or a velocity without a place.
 
 A set-point's way from the graph to the motors, and who may stop it:
 
@@ -10,9 +10,9 @@ A set-point's way from the graph to the motors, and who may stop it:
    capture does not see the vehicle (`paused`), or while a take-off or go-to is flown to its end (`guard_until`). One
    that counts ends whatever else was flown: a braking, an order that is being repeated.
 3. **The link** (`link`) gives it to cflib, whose driver (`drivers`) keeps the newest one until it can be sent.
-4. **When the stream stops.** `safety` looks at the command's age 50 times a second: :meth:`hold_place` of the
-   vehicle comes first, then `land`. Both brake by a stream of zero velocity, then give an order to the firmware's high-level
-   commander. The order goes out before the end of the stream, or the motors would stop for a moment.
+4. **When the stream stops.** `safety` checks the command's age 50 times a second: first the vehicle holds its place
+   (`hold_place`), then it lands (`land`). Both brake by a stream of zero velocity, then give an order to the firmware's
+   high-level commander. The order goes out before the end of the stream, or the motors would stop for a moment.
 
 The firmware's high-level commander flies polynomials of degree 7 from rest to rest, whatever the duration. If it is too
 short, the vehicle lags behind its path, and a landing stops the motors at the end of the path, wherever the vehicle is.
@@ -175,7 +175,7 @@ class Controls:
         return f"{self._machine.state.name.lower()}: {self._machine.reason}"
 
     def reset(self) -> None:
-        """A new connection."""
+        """Begin anew, with a new connection."""
         self.overruled = self.paused = self.streaming = self.held = False
         self._command_time = -math.inf
         self._blind = None
@@ -277,7 +277,7 @@ class Controls:
 
     # -- without a place --------------------------------------------------------------------------------------------
     @property
-    def blind(self) -> bool:
+    def is_blind(self) -> bool:
         """Whether it is steered without a place."""
         return self._blind is not None
 
@@ -287,7 +287,7 @@ class Controls:
         return self._blind is not None and self._blind[0][2] < 0.0
 
     def end_blind_flight(self) -> None:
-        """Places count again."""
+        """Let places count again."""
         self._blind = None
 
     def stop_blindly(self, now: float) -> None:

@@ -458,7 +458,7 @@ class CrazyflieVehicle:
         with self.lock:
             if self.controls.paused and self.tracker is not None:
                 self.controls.paused = self.tracker.age(now) > self.station.safety.position_age_s
-            if self.controls.blind:
+            if self.controls.is_blind:
                 self.controls.continue_blind_flight(self.state in IN_AIR, self._measured_place(now), now)
             elif self.last is not None:
                 self.controls.slow_down(self._speed, now)

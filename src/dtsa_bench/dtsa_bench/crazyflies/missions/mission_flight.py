@@ -43,7 +43,7 @@ from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .ground_station import Mission
+from .ground_station import GroundStation
 from .mission_record import MISSION_BAG
 from .places import APART_M, MissionError, check_places
 
@@ -58,11 +58,11 @@ class MissionWatch(ChannelObserver):
     come to rest. True once it is over; until then the agents avoid each other.
     """
 
-    def __init__(self, mission: Mission, channel: RealtimeChannel, metrics: FlightMetrics | None) -> None:
+    def __init__(self, mission: GroundStation, channel: RealtimeChannel, metrics: FlightMetrics | None) -> None:
         self._mission, self._channel, self._metrics = mission, channel, metrics
 
     def idle(self, status: ChannelStatus) -> None:
-        self._mission.bridge_alive()
+        self._mission.check_bridge_process()
         ended, metrics = self._mission.ended, self._metrics
         if metrics is not None and metrics.collided_pair and not ended.reason:
             a, b = metrics.collided_pair
@@ -79,14 +79,14 @@ class MissionWatch(ChannelObserver):
         return bool(gaps.min() >= APART_M)
 
 
-class _Station:
+class _MissionProcesses:
     """The processes of a mission, and the one order in which they end; `attach`: a bridge runs already, and goes on."""
 
     def __init__(self, settings: SwarmSettings, directory: Path, environment: dict[str, str], attach: bool) -> None:
         self.settings, self._directory, self._attach = settings, directory, attach
         self.context, self.progress = Context(), ProgressLine("fly")
         self.bridge, self.agents, self._recorder = (Children(directory / "log", environment) for _ in range(3))
-        self._mission: Mission | None = None
+        self._mission: GroundStation | None = None
 
     def start(self, swarm_yaml: Path) -> None:
         """Start the recorder, and the bridge unless there is one."""
@@ -97,7 +97,9 @@ class _Station:
             self.bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node",
                               ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
 
-    def take_off(self, run: RunConfig, scenario: Scenario, domain: int, ended: StopToken) -> tuple[RunConfig, Mission]:
+    def take_off(
+        self, run: RunConfig, scenario: Scenario, domain: int, ended: StopToken
+    ) -> tuple[RunConfig, GroundStation]:
         """Connect all vehicles, start the agents, and bring the vehicles into the air, at their places.
 
         Nothing of ours keeps the bridge waiting: it runs before all others, on a processor of its own, and what takes
@@ -108,8 +110,8 @@ class _Station:
         leave_that_processor()
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
-        mission = self._mission = Mission(node, self.settings, scenario, ended, self.progress.show)
-        mission.bridge_alive = mission.check_bridge if self._attach else self.bridge.check
+        mission = self._mission = GroundStation(node, self.settings, scenario, ended, self.progress.show)
+        mission.check_bridge_process = mission.check_bridge if self._attach else self.bridge.check
         mission.start()
         take_priority(below(self.settings.station.priority, 1))
         mission.connect()
@@ -201,7 +203,7 @@ def fly_crazyflies(
         environment = run_environment(domain, directory / "log")
         if page is not None:
             shown.enter_context(view_process(domain, environment, page))
-        station, ended = _Station(settings, directory, environment, attach), StopToken(stop)
+        station, ended = _MissionProcesses(settings, directory, environment, attach), StopToken(stop)
         station.start(swarm_yaml)
         try:
             run, mission = station.take_off(run, scenario, domain, ended)
@@ -234,7 +236,12 @@ def below(priority: int, steps: int) -> int:
 
 
 def _exchange(
-    station: _Station, run: RunConfig, directory: Path, options: FlightOptions, ended: StopToken, mission: Mission
+    station: _MissionProcesses,
+    run: RunConfig,
+    directory: Path,
+    options: FlightOptions,
+    ended: StopToken,
+    mission: GroundStation,
 ) -> Flight:
     agents, progress = station.agents, station.progress
     node = Node("channel", namespace=names.SWARM, context=station.context)
