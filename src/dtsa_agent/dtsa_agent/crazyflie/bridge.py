@@ -19,7 +19,7 @@ from dtsa_agent.core.settings.scenario import make_scenario
 
 from .addresses import WATCHDOG_HZ, check_budget, parse_address
 from .link import SIMULATED_RADIO, require_cflib
-from .onboard import OnboardSetup, key_of, orders, parameters
+from .onboard import OnboardSetup, app_orders, app_parameters, key_of
 from .safety import Action, RequiredAction, SafetyMonitor
 from .settings import SwarmSettings
 from .state import State, VehicleState
@@ -117,10 +117,10 @@ class Bridge:
         if (swarm := self.settings.swarm) is None:
             return
         key, scenario, station = key_of(swarm), make_scenario(swarm), self.settings.station
-        values = parameters(swarm, scenario, station.room_origin_in_world[2])
+        values = app_parameters(swarm, scenario, station.room_origin_in_world[2])
         for vehicle in self.vehicles.values():
             own = {name: vehicle.robot.firmware_params.get(name, value) for name, value in values.items()}
-            vehicle.link.board = OnboardSetup(own, orders(swarm, scenario, key), station.on_board.polls_hz)
+            vehicle.link.board = OnboardSetup(own, app_orders(swarm, scenario, key), station.on_board.polls_hz)
 
     def start_agents(self, names: Iterable[str] | None = None) -> str:
         """Start the agents on board of those that are connected, all at once; why some do not start, or ""."""

@@ -24,7 +24,7 @@ from dtsa_agent.core.errors import ConfigError
 
 from .addresses import LinkCounters, LinkError
 from .commands import Setpoint
-from .onboard import OnboardSetup
+from .onboard import START, OnboardSetup, send_order
 from .positions import SettlingCheck
 from .settings import RobotSettings
 from .state import LOG_VARIABLES, Vector, VehicleState, decode_log
@@ -344,7 +344,7 @@ class CrazyflieLink:
         if cf is None or board is None:
             return "not connected"
         try:
-            board.start(cf)
+            send_order(cf, START)
         except LinkError as error:
             return str(error)
         if self._driver is not None:

@@ -15,7 +15,7 @@ from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.onboard import KEY_BYTES, PORT, START, check_onboard_swarm, orders, parameters
+from dtsa_agent.crazyflie.onboard import KEY_BYTES, PORT, START, app_orders, app_parameters, check_onboard_swarm
 from dtsa_bench.log.agent_bag import AgentRecorder
 
 from .app import App, LabSettings, read_app
@@ -143,9 +143,9 @@ class OnboardSwarm:
     def prepare(self, agent: int) -> None:
         """Tell one that has just been switched on its settings and everybody's places, and start it."""
         lab, now = self.lab, self.lab.time
-        for name, value in parameters(self.swarm, self.scenario, HEIGHT_M).items():
+        for name, value in app_parameters(self.swarm, self.scenario, HEIGHT_M).items():
             lab.set_parameter(agent, name, value)
-        for i, order in enumerate([*orders(self.swarm, self.scenario, self._key), START]):
+        for i, order in enumerate([*app_orders(self.swarm, self.scenario, self._key), START]):
             self._at(now + 0.1 + i * _ORDER_S, lab.send, agent, order)
 
     def come_back(self, agent: int, after_s: float) -> None:
