@@ -79,10 +79,7 @@ class Address:
 
 
 def parse_address(uri: str) -> Address:
-    """Read an address.
-
-    :raises ConfigError: cflib would not understand it.
-    """
+    """Read an address; ConfigError: cflib would not understand it."""
     if match := _RADIO.fullmatch(uri):
         channel, node = int(match["channel"] or 2), (match["node"] or "E7E7E7E7E7").upper().rjust(10, "0")
         if channel > LAST_CHANNEL:

@@ -277,11 +277,6 @@ class Controls:
 
     # -- without a place --------------------------------------------------------------------------------------------
     @property
-    def is_blind(self) -> bool:
-        """Whether it is steered without a place."""
-        return self._blind is not None
-
-    @property
     def sinks_blindly(self) -> bool:
         """Whether it sinks without a place."""
         return self._blind is not None and self._blind[0][2] < 0.0
@@ -290,27 +285,23 @@ class Controls:
         """Let places count again."""
         self._blind = None
 
-    def stop_blindly(self, now: float) -> None:
-        """Zero velocity, whatever the estimate says."""
-        self._steer_blindly(STANDSTILL, math.inf, now)
-
-    def sink_blindly(self, height: float, now: float) -> None:
-        """Sink by velocity alone for as long as the last known height (m) takes, and some more."""
-        self._steer_blindly((0.0, 0.0, -SINK_MPS), now + height / SINK_MPS + SINK_MORE_S, now)
-
-    def _steer_blindly(self, velocity: Vector, until: float, now: float) -> None:
-        self._brake, self._blind = None, (velocity, until)
-        self.held, self.streaming = False, True
+    def fly_blindly(self, now: float, sink_from: float | None = None) -> None:
+        """Stand still by velocity alone; `sink_from`: or sink for as long as this height (m) takes, and some more."""
+        self._blind = STANDSTILL, math.inf
+        if sink_from is not None:
+            self._blind = (0.0, 0.0, -SINK_MPS), now + sink_from / SINK_MPS + SINK_MORE_S
+        self._brake, self.held, self.streaming = None, False, True
         self.delivery.cancel()
-        self._link.stream(velocity_world(velocity, 0.0, now))
+        self._link.stream(velocity_world(self._blind[0], 0.0, now))
 
-    def continue_blind_flight(self, in_air: bool, seen: Vector | None, now: float) -> None:
-        """The next packet of a stream that needs no place; the motors stop once the vehicle must be down.
+    def continue_blind_flight(self, in_air: bool, seen: Vector | None, now: float) -> bool:
+        """Send the next packet of a stream that needs no place; the motors stop once the vehicle must be down.
 
         :param seen: m, world, where motion capture sees it; None: not at all.
+        :returns: False: it is not steered without a place.
         """
         if self._blind is None:
-            return
+            return False
         velocity, until = self._blind
         if not in_air:
             self._blind = None
@@ -319,3 +310,4 @@ class Controls:
             self._link.order(end_of_stream)  # with nothing to fly the end of the stream stops the motors
         else:
             self._link.stream(velocity_world(velocity, 0.0, now))
+        return True

@@ -46,10 +46,7 @@ Send = Callable[[Any], None]  # gives an order to cflib's `Crazyflie`
 
 
 def require_cflib() -> None:
-    """Load cflib's drivers, once.
-
-    :raises ConfigError: cflib is not installed; the text says how to get it.
-    """
+    """Load cflib's drivers, once; ConfigError: cflib is not installed; the text says how to get it."""
     if importlib.util.find_spec("cflib") is None:
         allowed = "an installed cflib: tools/dtsa setup --extra cflib, or pip install cflib==0.1.34"
         raise ConfigError("cflib", "not installed", allowed)
@@ -222,10 +219,7 @@ class CrazyflieLink:
         return reason
 
     def _connect(self) -> None:
-        """Connect once.
-
-        :raises LinkError: it did not work.
-        """
+        """Connect once; LinkError: it did not work."""
         from cflib.crazyflie import Crazyflie
 
         self._drop()

@@ -65,10 +65,7 @@ class OnboardSettings(Settings):
 
 
 def check_onboard_swarm(swarm: SwarmConfig) -> None:
-    """Refuse a swarm that the app cannot fly.
-
-    :raises ConfigError: it cannot.
-    """
+    """Refuse a swarm that the app cannot fly; ConfigError: it cannot."""
     if swarm.agents > MAX_AGENTS:
         raise ConfigError("agents", swarm.agents, f"1 to {MAX_AGENTS} on board")
     if swarm.policy not in POLICIES:

@@ -156,10 +156,7 @@ class PoseTracker:
         return MeasuredPose(place, (x, y, z, w), stamp, now)
 
     def _check_follows(self, last: MeasuredPose, seen: MeasuredPose, *, flying: bool) -> None:
-        """Whether a pose can follow the one before.
-
-        :raises RefusedPose: it cannot.
-        """
+        """Whether a pose can follow the one before; RefusedPose: it cannot."""
         passed = seen.time - last.time
         if seen.stamp and last.stamp and seen.stamp <= last.stamp:
             raise RefusedPose("stamp", f"its stamp is {last.stamp - seen.stamp:.3f} s before that of the last one")

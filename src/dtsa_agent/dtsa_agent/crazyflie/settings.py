@@ -147,10 +147,7 @@ class SwarmSettings:
 
     @property
     def swarm(self) -> SwarmConfig | None:
-        """What the agents on board share; None: the bridge steers.
-
-        :raises ConfigError: it is not usable.
-        """
+        """What the agents on board share; None: the bridge steers; ConfigError: it is not usable."""
         given = self.station.on_board
         if not given.on:
             return None
@@ -178,18 +175,12 @@ class SwarmSettings:
 
 
 def load_swarm(path: Path) -> SwarmSettings:
-    """Read and check a swarm's YAML.
-
-    :raises ConfigError: the file cannot be read, or something in it is not usable.
-    """
+    """Read and check a swarm's YAML; ConfigError: the file cannot be read, or something in it is not usable."""
     return parse_swarm(read_yaml(path, "config"))
 
 
 def parse_swarm(data: object) -> SwarmSettings:
-    """Settings from the contents of a swarm's YAML.
-
-    :raises ConfigError: something in it is not usable.
-    """
+    """Settings from the contents of a swarm's YAML; ConfigError: something in it is not usable."""
     top = _mapping("config", data)
     unused = [str(key) for key in top if key not in SECTIONS]
     types = _mapping("robot_types", top.get("robot_types"))

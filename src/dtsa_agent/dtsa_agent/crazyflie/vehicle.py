@@ -355,7 +355,7 @@ class CrazyflieVehicle:
             self.action = f"hold: {reason}"
             if self._watch.wrong:
                 self.controls.overruled = True
-                self.controls.stop_blindly(time.monotonic())
+                self.controls.fly_blindly(time.monotonic())
                 return
             self.controls.paused = until_seen
 
@@ -400,7 +400,7 @@ class CrazyflieVehicle:
             if self._watch.wrong:
                 now = time.monotonic()
                 seen = self._measured_place(now)
-                controls.sink_blindly(self._trusted_height if seen is None else seen[2], now)
+                controls.fly_blindly(now, self._trusted_height if seen is None else seen[2])
                 return ""
             way = self._height - height
             if 0.0 < duration < (seconds := landing_s(way, duration, self.station)):
@@ -458,9 +458,8 @@ class CrazyflieVehicle:
         with self.lock:
             if self.controls.paused and self.tracker is not None:
                 self.controls.paused = self.tracker.age(now) > self.station.safety.position_age_s
-            if self.controls.is_blind:
-                self.controls.continue_blind_flight(self.state in IN_AIR, self._measured_place(now), now)
-            elif self.last is not None:
+            blind = self.controls.continue_blind_flight(self.state in IN_AIR, self._measured_place(now), now)
+            if not blind and self.last is not None:
                 self.controls.slow_down(self._speed, now)
             if self.state not in OFF:
                 self.link.order_log(now)

@@ -216,10 +216,7 @@ class BridgeInputs:
 
 # -- motion capture ---------------------------------------------------------------------------------------------------
 def named_pose_array() -> Any:
-    """Return the type of the named poses.
-
-    :raises ConfigError: its package is not in the workspace.
-    """
+    """Return the type of the named poses; ConfigError: its package is not in the workspace."""
     try:
         from motion_capture_tracking_interfaces.msg import NamedPoseArray
     except ImportError:

@@ -106,10 +106,7 @@ class GroundStation:
                 self._stop_here.publish(EmptyMessage())
 
     def check_bridge(self) -> None:
-        """For a bridge that is not a child of this process.
-
-        :raises MissionError: nothing is heard of it.
-        """
+        """For a bridge that is not a child of this process; MissionError: nothing is heard of it."""
         silent = time.monotonic() - self.last_status_time
         if self.status and silent > BRIDGE_SILENT_S:
             raise MissionError(f"the bridge has been silent for {silent:.1f} s")
@@ -126,10 +123,7 @@ class GroundStation:
         self._pulse.join(2.0)
 
     def call(self, name: str, timeout: float = 10.0, **fields: Any) -> Any:
-        """Call a service and wait for its answer (s, at most).
-
-        :raises MissionError: it does not answer or says no.
-        """
+        """Call a service and wait for its answer (s, at most); MissionError: it does not answer or says no."""
         client = self._clients[name]
         future = client.call_async(client.srv_type.Request(**fields))
         end = time.monotonic() + timeout
@@ -144,10 +138,7 @@ class GroundStation:
         return response
 
     def wait(self, what: str, condition: Callable[[], bool], timeout: float) -> None:
-        """Wait until something is so (s, at most).
-
-        :raises MissionError: it takes too long, or the user interrupts.
-        """
+        """Wait until something is so (s, at most); MissionError: it takes too long, or the user interrupts."""
         end = time.monotonic() + timeout
         while not condition():
             self.check_bridge_process()
@@ -176,10 +167,7 @@ class GroundStation:
         return self._all(Status.STATE_READY)
 
     def find_places(self, config: SwarmConfig) -> SwarmConfig:
-        """The configuration in which everybody begins near where it stands.
-
-        :raises MissionError: it is not safe to begin.
-        """
+        """The configuration in which everybody begins near where it stands; MissionError: it is not safe to begin."""
         vehicles = [robot.name for robot in self.settings.robots]
         measured = np.array([self.place[name] for name in vehicles]).T
         check_standing(vehicles, measured, self.settings.station.safety)

@@ -112,10 +112,7 @@ def assign_places(config: SwarmConfig, measured: Array) -> SwarmConfig:
 
 
 def check_standing(names: Sequence[str], measured: Array, fence: SafetySettings) -> None:
-    """Whether all can take off where they stand, (3, N), m, frame map.
-
-    :raises MissionError: with names and distances.
-    """
+    """Whether all can take off where they stand, (3, N), m, frame map; MissionError: with names and distances."""
     problems = []
     if fence.geofence:
         low, high = np.array(fence.geofence_min)[:2], np.array(fence.geofence_max)[:2]

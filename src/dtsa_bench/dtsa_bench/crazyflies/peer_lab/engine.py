@@ -180,17 +180,11 @@ class Engine:
         return int(self._library.lab_type(vehicle, int(parameter), self._variables[vehicle, int(parameter)][name]))
 
     def get(self, vehicle: int, name: str, *, parameter: bool) -> float:
-        """Value of a parameter or a log variable of the app.
-
-        :raises KeyError: it has none of that name, or is switched off.
-        """
+        """Value of a parameter or a log variable of the app; KeyError: it has none of that name, or is switched off."""
         return float(self._library.lab_get(vehicle, int(parameter), self._variables[vehicle, int(parameter)][name]))
 
     def set(self, vehicle: int, now_ns: int, name: str, value: float) -> None:
-        """Set a parameter of the app.
-
-        :raises KeyError: it has none of that name, or is switched off.
-        """
+        """Set a parameter of the app; KeyError: it has none of that name, or is switched off."""
         self._library.lab_set(vehicle, now_ns, self._variables[vehicle, 1][name], value)
 
 

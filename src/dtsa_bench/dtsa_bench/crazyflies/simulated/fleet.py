@@ -254,10 +254,7 @@ class Fleet:
             self._control.sendto(json.dumps(answer, default=str).encode(), host)
 
     def fault(self, request: dict[str, Any]) -> None:
-        """Let vehicles fail (see `check_fault`).
-
-        :raises ConfigError: it is not understood.
-        """
+        """Let vehicles fail (see `check_fault`); ConfigError: it is not understood."""
         name, indices = check_fault(request, self.config.count)
         for k in indices:
             self._apply(name, k, request)

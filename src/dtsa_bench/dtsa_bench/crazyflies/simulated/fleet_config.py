@@ -61,10 +61,7 @@ class RadioAddress:
 
     @classmethod
     def of(cls, uri: str) -> RadioAddress:
-        """The station of a URI such as radio://0/80/2M/E7E7E7E701.
-
-        :raises ConfigError: it is not of that kind.
-        """
+        """The station of a URI such as radio://0/80/2M/E7E7E7E701; ConfigError: it is not of that kind."""
         parts = uri.partition("?")[0].removeprefix("radio://").split("/")
         if not uri.startswith("radio://") or len(parts) != 4:
             raise ConfigError("uri", uri, "radio://RADIO/CHANNEL/RATE/ADDRESS for a simulated radio")

@@ -70,7 +70,7 @@ class CrtpPeer:
             (crtp.LINK, 1): lambda data, t: b"Bitcraze Crazyflie".ljust(30, b"\0"),
             (crtp.LINK, 3): lambda data, t: data,
             (crtp.PLATFORM, 0): self._platform,
-            (crtp.PLATFORM, 1): self._version,
+            (crtp.PLATFORM, 1): lambda data, t: bytes((0, self.protocol)) if data[:1] == b"\0" else None,
             (crtp.PLATFORM, 2): self._app_channel,
             (crtp.LOG, 0): lambda data, t: self._log_table.answer(data),
             (crtp.LOG, 1): self._log_settings,
@@ -79,13 +79,13 @@ class CrtpPeer:
             (crtp.PARAM, 2): self._param_write,
             (crtp.PARAM, 3): self._param_misc,
             (crtp.MEMORY, 0): lambda data, t: b"\x01\0" if data[:1] == b"\x01" else None,  # there are none
-            (crtp.COMMANDER, 0): self._manual,
+            (crtp.COMMANDER, 0): lambda data, t: self.firmware.manual(data, t),
             (crtp.LOCALIZATION, 0): self._ext_position,
             (crtp.LOCALIZATION, 1): self._localization,
             (crtp.LOCALIZATION, 2): self._ext_positions,
-            (crtp.GENERIC_COMMANDER, 0): self._stream,
+            (crtp.GENERIC_COMMANDER, 0): lambda data, t: self.firmware.stream(data, t),
             (crtp.GENERIC_COMMANDER, 1): self._meta,
-            (crtp.HIGH_LEVEL, 0): self._high_level,
+            (crtp.HIGH_LEVEL, 0): lambda data, t: data[:3] + bytes((self.firmware.high_level(data, t),)),
         }
         if protocol >= 12:
             self._handlers[crtp.SUPERVISOR, 0] = self._supervisor_info
@@ -138,9 +138,6 @@ class CrtpPeer:
             self._app.receive(data)
 
     # -- handlers: request's data and time in, reply's data out -----------------------------------------------------
-    def _version(self, data: bytes, t: float) -> bytes | None:
-        return bytes((0, self.protocol)) if data[:1] == b"\0" else None
-
     def _platform(self, data: bytes, t: float) -> bytes | None:
         if data[:1] == b"\x01" and len(data) > 1:
             ok = self.firmware.supervisor.request_arming(bool(data[1]))
@@ -199,18 +196,9 @@ class CrtpPeer:
         elif kind == 4:
             self.firmware.supervisor.watchdog(t)
 
-    def _manual(self, data: bytes, t: float) -> None:
-        self.firmware.manual(data, t)
-
-    def _stream(self, data: bytes, t: float) -> None:
-        self.firmware.stream(data, t)
-
     def _meta(self, data: bytes, t: float) -> None:
         if data[:1] == b"\0":
             self.firmware.notify_stop()
-
-    def _high_level(self, data: bytes, t: float) -> bytes:
-        return data[:3] + bytes((self.firmware.high_level(data, t),))
 
     def _log_settings(self, data: bytes, t: float) -> bytes | None:
         command = data[0]

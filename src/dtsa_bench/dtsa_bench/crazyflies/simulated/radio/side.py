@@ -86,10 +86,7 @@ class RadioServer:
             self.listen()
 
     def listen(self) -> None:
-        """Hosts may connect, and the fleet's time begins.
-
-        :raises ConfigError: the socket cannot be made.
-        """
+        """Hosts may connect, and the fleet's time begins; ConfigError: the socket cannot be made."""
         self.listener = _listen(self.settings.path)
         self.origin_ns = time.monotonic_ns()
 
