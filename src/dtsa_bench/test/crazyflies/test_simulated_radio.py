@@ -10,7 +10,7 @@ from dtsa_agent.crazyflie import addresses as budget
 from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
 from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, BROADCAST, RATE_NAMES, Agenda, RadioAir
-from dtsa_bench.crazyflies.simulated.radio.dongle import SimulatedDongle
+from dtsa_bench.crazyflies.simulated.radio.dongle import DongleModel
 from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, RadioReceiver
 from dtsa_bench.crazyflies.simulated.radio.sniffer_mode import SnifferMode
 
@@ -41,7 +41,7 @@ class Room:
         air = RadioAir(first - 1 + len(by_id), self.settings.loss, self.settings.seed)
         sniffers: dict[int, SnifferMode] = {}
         self.dongles = [
-            SimulatedDongle(k, self.settings, air, self.agenda, by_id, self._hears, sniffers) for k in range(1, first)
+            DongleModel(k, self.settings, air, self.agenda, by_id, self._hears, sniffers) for k in range(1, first)
         ]
 
     def _hears(self, radio: int, up: bool) -> bool:
@@ -184,7 +184,7 @@ THREE = RadioSettings(dongles=3, request_ms=0.0)
 class Ears:
     """What a host reads of a dongle in sniffer mode, as long as it reads."""
 
-    dongle: SimulatedDongle
+    dongle: DongleModel
     room: Room
     reads: bool = True
     packets: list[tuple[int, bytes]] = field(default_factory=list)

@@ -9,7 +9,7 @@ import numpy as np
 
 from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
 from dtsa_bench.crazyflies.simulated.radio.air import RATE_NAMES, Agenda, RadioAir
-from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, SimulatedDongle
+from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, DongleModel
 from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, RadioReceiver
 
 from .app import LabSettings
@@ -37,7 +37,7 @@ class Polling:
         for agent, receiver in receivers.items():
             receiver.on_packet = partial(taken, agent)
         radio = RadioSettings(seed=settings.seed, request_ms=0.0)
-        self._dongle = SimulatedDongle(count + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
+        self._dongle = DongleModel(count + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
         self._dongle.request(SET_CHANNEL, settings.channel, 0, b"", 0)
         self._dongle.request(SET_RATE, RATE_NAMES.index(settings.rate), 0, b"", 0)
         self._gap_ns = round(1e9 / (settings.polls * count))

@@ -41,7 +41,7 @@ class StateAges:
         self._area = np.zeros(shape)  # ms s
         self._worst = np.zeros(shape, dtype=np.int64)
 
-    def heard(self, receiver: int, sender: int, stamp_ns: int, now_ns: int) -> None:
+    def add_state(self, receiver: int, sender: int, stamp_ns: int, now_ns: int) -> None:
         """A state of a sender (id) has come to a receiver (id)."""
         pair = receiver - 1, sender - 1
         if stamp_ns <= self._stamp[pair]:
@@ -118,7 +118,7 @@ class Record:
         self._digest_update(1, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, heard=agent, sender=packet.sender, port=packet.raw[0], data=packet.data.hex())
         if packet.sender and self._carries_state(packet.data, agent):
-            self._ages.heard(agent, packet.sender, packet.ordered_ns, now_ns)
+            self._ages.add_state(agent, packet.sender, packet.ordered_ns, now_ns)
 
     def _note_command(self, agent: int, now_ns: int, command: tuple[int, bytes]) -> None:
         self._digest_update(2 + command[0], agent, now_ns, command[1])

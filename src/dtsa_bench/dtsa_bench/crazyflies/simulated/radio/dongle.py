@@ -35,7 +35,7 @@ class _Transfer:
     reply: tuple[OnAir, bytes] | None = None  # the acknowledgement to this dongle
 
 
-class SimulatedDongle:
+class DongleModel:
     """One Crazyradio; radios are named by their ids on the air. It adds its own sniffer to those of all dongles.
 
     :param passes: says whether a packet to (True) or from a Crazyflie passes the faults of its link.

@@ -27,7 +27,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.simulated.fleet_config import DEVICES, RadioSettings
 
 from .air import Agenda, RadioAir
-from .dongle import SimulatedDongle
+from .dongle import DongleModel
 from .receiver import RadioReceiver
 from .sniffer_mode import SnifferMode
 
@@ -76,7 +76,7 @@ class RadioServer:
         self.first = first
         sniffers: dict[int, SnifferMode] = {}
         self.dongles = [
-            SimulatedDongle(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up), sniffers)
+            DongleModel(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up), sniffers)
             for k in range(1, first)
         ]
         self._taken: set[int] = set()
@@ -137,7 +137,7 @@ class RadioServer:
         host.dongle = number
         return True
 
-    def _use(self, dongle: SimulatedDongle, host: RadioHost, message: bytes) -> None:
+    def _use(self, dongle: DongleModel, host: RadioHost, message: bytes) -> None:
         kind = message[0]
         if kind == REQUEST and len(message) >= _REQUEST.size:
             _, number, value, index = _REQUEST.unpack_from(message)
