@@ -78,17 +78,18 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         wait_for(lambda: graph.place(1) == pytest.approx((x - 0.3, 0.2, 1.05), abs=0.05))
         # Streamed commands, with yaw: cf2 by velocity, cf1 by position.
         y = graph.place(2)[1]
-        for _ in range(50):
+
+        def followed() -> bool:
             message = VelocityWorld(yaw_rate=57.3)
             message.vel.y = -0.4
             graph.velocity[2].publish(message)
-            place = Position(x=x - 0.3, y=0.0, z=0.95, yaw=57.3)
-            graph.position.publish(place)
-            time.sleep(0.02)
-        assert graph.place(2)[1] < y - 0.2
-        turned = graph.last["/cf2/odom"].pose.pose.orientation
-        assert turned.z > 0.2  # counter-clockwise
-        assert graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.95), abs=0.15)
+            graph.position.publish(Position(x=x - 0.3, y=0.0, z=0.95, yaw=57.3))
+            time.sleep(0.01)
+            turned = graph.last["/cf2/odom"].pose.pose.orientation.z > 0.2  # counter-clockwise
+            there = graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.95), abs=0.15)
+            return bool(graph.place(2)[1] < y - 0.2 and turned and there)
+
+        wait_for(followed)
         status = graph.last["/cf2/status"]
         assert status.supervisor_info & Status.SUPERVISOR_INFO_IS_FLYING
         assert 3.0 < status.battery_voltage < 4.2
