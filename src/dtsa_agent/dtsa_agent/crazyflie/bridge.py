@@ -178,7 +178,7 @@ class Bridge:
         return ""
 
     def land_all(self, reason: str) -> None:
-        """Land whoever flies."""
+        """Land all that fly."""
         for vehicle in self.vehicles.values():
             if vehicle.state in (State.ARMED, State.FLYING):
                 vehicle.land(reason)
@@ -274,7 +274,7 @@ class Bridge:
             time.sleep(TICK_S)
 
     def close(self) -> None:
-        """Close all links in parallel. Whoever still flies is stopped first: a closed link would let it fall anyway."""
+        """Close all links in parallel. One that flies is stopped first: a closed link would let it fall anyway."""
         flying = self.names_in_air(time.monotonic())
         for name in flying:
             self.vehicles[name].stop("the bridge ends")

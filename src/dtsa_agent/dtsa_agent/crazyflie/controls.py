@@ -1,6 +1,6 @@
 """What a Crazyflie's firmware has to fly: a stream of commands, a path, a landing, or a velocity without a place.
 
-A set-point's way from the graph to the motors, and who may stop it:
+A set-point's way from the graph to the motors, and what may stop it:
 
 1. **Topic.** `commands` reads each vehicle's `cmd_*` topics in a thread of its own, turns a message into a
    :class:`~dtsa_agent.crazyflie.commands.Setpoint`, dated by its publication, and refuses one that is too fast or leads

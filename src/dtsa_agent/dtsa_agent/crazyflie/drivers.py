@@ -519,7 +519,7 @@ class DongleSet:
 
     @property
     def foreign(self) -> list[str]:
-        """Dongles on whose channels somebody else seems to send."""
+        """Dongles on whose channels another radio seems to send."""
         return [name for name, dongle in sorted(self._dongles.items()) if dongle.foreign]
 
     def stop_all(self) -> None:

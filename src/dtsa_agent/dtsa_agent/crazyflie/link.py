@@ -30,12 +30,12 @@ from .settings import RobotSettings
 from .state import LOG_VARIABLES, Vector, VehicleState, decode_log
 
 SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Crazyradios, for simulation only
-FIRST_ANSWER_S = 2.0  # over the air nothing else tells that nobody is there
+FIRST_ANSWER_S = 2.0  # over the air nothing else shows that no Crazyflie is there
 AUDIBLE_S = 0.25  # something came or was acknowledged within that time: it can be heard
 CLOSED_PORT_S = 10.0  # simulated Crazyflies that are started at the same time take so long to listen
 PAUSE_S = (0.1, 0.5)  # first and longest pause before a closed port is asked again
 LOG_ORDER_S = 0.4  # nothing logged for that long, though it can be heard: the log is ordered anew
-REFUSED = f"[Errno {errno.ECONNREFUSED}]"  # in the words of a driver: nobody listens there
+REFUSED = f"[Errno {errno.ECONNREFUSED}]"  # in a driver's words: the port is closed
 VARIANCES = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
 PLACE = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")
 INITIAL = ("kalman.initialX", "kalman.initialY", "kalman.initialZ")
@@ -211,9 +211,9 @@ class CrazyflieLink:
                 reason = f"attempt {attempt} of {attempts}: {error}"
                 self._drop()
                 # A closed port says so at once: that is no attempt as long as it may be about to be opened.
-                nobody = REFUSED in reason and time.monotonic() < patience
-                attempt += not nobody
-                if nobody:
+                closed = REFUSED in reason and time.monotonic() < patience
+                attempt += not closed
+                if closed:
                     time.sleep(pause)
                     pause = min(2 * pause, longest)
         return reason

@@ -90,7 +90,7 @@ class PoseTracker:
     """Poses of one Crazyflie.
 
     :param origin: m, where the Crazyflies' world sees the origin of `map`.
-    :param room: nobody is outside of it (m, map), but for a margin; None: no limits.
+    :param room: corners of the box (m, map) outside of which no pose is believed, but for a margin; None: no limits.
     """
 
     settings: PositionSettings

@@ -448,7 +448,7 @@ class CrazyflieVehicle:
             was_in_air = self.state in IN_AIR
             self.machine.silent(reason)
             if not was_in_air:
-                self.controls.delivery.cancel()  # a take-off that comes late takes nobody by surprise
+                self.controls.delivery.cancel()  # a take-off that comes late would surprise
             elif self.link.connected and not self.controls.delivery.landing:
                 self.land(reason)
                 self.controls.repeat_landing(now)

@@ -130,9 +130,9 @@ class BridgeNode(Node):
 class _Interrupts:
     """The first Ctrl-C (or SIGTERM, or a terminal that is closed) lands all; one more Ctrl-C is the emergency stop.
 
-    Only that: who starts processes, like `ros2 launch`, sends SIGTERM to those that take long to end.
+    Only that: programs that start processes, like `ros2 launch`, send SIGTERM to those that take long to end.
     Signals may come at once. A handler that interrupts another one must not wait for a lock that this one holds, as
-    that of `threading.Event` does: the bridge would stand still, and nobody would land.
+    that of `threading.Event` does: the bridge would stand still, and no vehicle would land.
     """
 
     def __init__(self) -> None:
@@ -185,7 +185,7 @@ def run_node(node: BridgeNode) -> int:
 def check_node(node: BridgeNode, print_line: Callable[[str], None]) -> int:
     """Connect, look at everything that a flight needs, and close; exit code 1 if something is missing.
 
-    No motor turns, and the emergency watchdog is not fed: afterwards everybody can fly as before.
+    No motor turns, and the emergency watchdog is not fed: afterwards all can fly as before.
     """
     interrupts = _Interrupts()
     level = node.settings.station.priority

@@ -39,7 +39,7 @@ from .parameters import FirmwareParameters
 
 FRAME = "world"
 LATEST_ONLY = QoSProfile(depth=1)
-# Whoever publishes, reliably or not; a pose that is late is worth nothing.
+# Takes reliable publishers and others; a pose that is late is worth nothing.
 SENSOR = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LEVELS = {"info": 20, "warn": 30, "error": 40}
 ARMED_S, ARMED_POLL_S = 3.0, 0.02  # longest wait for motors that are to run, or to be locked
@@ -85,7 +85,7 @@ class BridgeInputs:
         self._masks = {name: vehicle.robot.group_mask for name, vehicle in bridge.vehicles.items()}
 
     def offer(self) -> None:
-        """Create everything; `/all/emergency` is last: whoever waits for it knows that everything else is there."""
+        """Create everything; `/all/emergency` is last: a program that waits for it knows that all else is there."""
         streams = (
             (interfaces.FullState, "cmd_full_state", FULL_STATE),
             (interfaces.Position, "cmd_position", POSITION),
@@ -267,7 +267,7 @@ class BridgeOutputs:
         self._state: dict[str, Any] = {}
         self._status: dict[str, Any] = {}  # Crazyswarm2's, beside ours
         self._odom_message: dict[str, Odometry] = {}
-        self._wanted: dict[str, tuple[bool, bool]] = {}  # odometry, pose: does somebody listen?
+        self._wanted: dict[str, tuple[bool, bool]] = {}  # odometry, pose: is there a subscriber?
         self._counted: dict[str, tuple[int, int]] = {}
         self._critical = {robot.name: robot.battery.voltage_critical for robot in settings.robots}
         positions = settings.station.positions
@@ -284,9 +284,9 @@ class BridgeOutputs:
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
 
     def publish_state(self, vehicle: CrazyflieVehicle, state: VehicleState) -> None:
-        """Odometry and pose of one log packet, in the link's thread; only what somebody listens to.
+        """Odometry and pose of one log packet, in the link's thread, if there are subscribers.
 
-        Whoever has entered another state says so at once: others may fly towards it.
+        A new state is published at once: other vehicles may fly towards it.
         """
         name = vehicle.name
         if vehicle.state != self._reported.get(name):
@@ -313,12 +313,12 @@ class BridgeOutputs:
             self._pose[name].publish(PoseStamped(header=message.header, pose=message.pose.pose))
 
     def publish_event(self, level: str, line: str) -> None:
-        """One line of the log, for those who record a mission."""
+        """Publish one line of the log, for a mission's record."""
         stamp = self._clock.now().to_msg()
         self._events.publish(Log(stamp=stamp, level=LEVELS.get(level, 20), name=self._name, msg=line))
 
     def publish_status(self, snapshots: Sequence[Snapshot]) -> None:
-        """Status of all; also looks who listens to odometry and pose."""
+        """Publish the status of all; also count the subscribers of odometry and pose."""
         stamp = self._clock.now().to_msg()
         for s in snapshots:
             self._wanted[s.name] = (

@@ -153,7 +153,7 @@ class GroundStation:
         return len(self.status) == len(self.settings.robots) and all(s.state in states for s in self.status.values())
 
     def connect(self) -> None:
-        """Bridge up, everybody ready, and it is known where each stands."""
+        """Wait until the bridge is up, all are ready, and it is known where each stands."""
         emergency = self._clients["/all/emergency"]
         self.wait("the bridge's start", emergency.service_is_ready, BRIDGE_S)
         self._beating.set()
@@ -167,7 +167,7 @@ class GroundStation:
         return self._all(Status.STATE_READY)
 
     def find_places(self, config: SwarmConfig) -> SwarmConfig:
-        """The configuration in which everybody begins near where it stands; MissionError: it is not safe to begin."""
+        """Return the configuration in which all begin near where they stand; MissionError: it is not safe to begin."""
         vehicles = [robot.name for robot in self.settings.robots]
         measured = np.array([self.place[name] for name in vehicles]).T
         check_standing(vehicles, measured, self.settings.station.safety)
@@ -228,7 +228,7 @@ class GroundStation:
 
     @property
     def flying(self) -> list[str]:
-        """Who was in the air, or may have been, when it was last heard of."""
+        """Names of those that were in the air, or may have been, by their last status."""
         return [name for name, s in sorted(self.status.items()) if s.state in IN_AIR]
 
     def at_rest(self, apart: Callable[[], bool]) -> bool:

@@ -269,7 +269,7 @@ def _exchange(
             if ended.stop.count > 1:
                 urgent.append(signal.SIGINT)
             if ended:
-                mission.order_landing()  # before the agents end: nobody flies on without them
+                mission.order_landing()  # before the agents end: no vehicle flies on without them
             agents.stop()
             mission.land(urgent)
         give_way()  # the bridge does not: it has to watch them

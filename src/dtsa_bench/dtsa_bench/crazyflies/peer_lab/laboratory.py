@@ -264,7 +264,7 @@ class Laboratory:
         self.agenda.at(frame.end_ns, lambda: self._resolve(packet, frame))
 
     def _resolve(self, packet: PeerPacket, frame: OnAir) -> None:
-        """A packet has left the air: who has it?"""
+        """Find the receivers of a packet that has left the air."""
         self.record.on_air_ns += frame.end_ns - frame.air_ns
         self.deliver_packet(packet, self.air.receivers_of(self.settings.channel, frame), frame)
 
@@ -397,7 +397,7 @@ class Laboratory:
         return not self._on[k] or self._engine.app_channel(k, self.now_ns, data)
 
     def transmit(self, data: bytes, port: int = 0) -> None:
-        """A foreign radio on the channel sends a peer-to-peer packet now, whoever else does.
+        """A foreign radio on the channel sends a peer-to-peer packet now, whatever else is on the air.
 
         :param data: at most 60 bytes.
         """

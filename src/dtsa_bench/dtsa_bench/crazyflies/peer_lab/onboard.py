@@ -141,7 +141,7 @@ class OnboardSwarm:
         self._at(enable_s, self.lab.set_parameter, agent, "dtsa.enable", 1)
 
     def prepare(self, agent: int) -> None:
-        """Tell one that has just been switched on its settings and everybody's places, and start it."""
+        """Send an agent that has just been switched on its settings and all places, and start it."""
         lab, now = self.lab, self.lab.time
         for name, value in app_parameters(self.swarm, self.scenario, HEIGHT_M).items():
             lab.set_parameter(agent, name, value)

@@ -108,7 +108,7 @@ def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
 
 
 def request_fault(args: argparse.Namespace) -> None:
-    """Send a fault to a running fleet; ConfigError: nobody listens, or it was refused."""
+    """Send a fault to a running fleet; ConfigError: no fleet listens, or it was refused."""
     cf: object = args.cf
     if args.cf != "all":
         try:

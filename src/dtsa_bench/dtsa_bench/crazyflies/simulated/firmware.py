@@ -94,7 +94,7 @@ def _decode_full_state(data: bytes, t: float) -> FirmwareSetpoint:
     return FirmwareSetpoint(t, position, velocity, acceleration, yaw=yaw, yaw_rate=values[12] / 1000)
 
 
-# Type byte of a packet on the generic commander's port -> decoder. 8 and 10 count yaw rates as everybody does; the
+# Type byte of a packet on the generic commander's port -> decoder. 8 and 10 count yaw rates as usual; the
 # older 1 and 5 have the opposite sign and are not sent to protocol version 9 and later.
 DECODERS: dict[int, tuple[int, Callable[[bytes, float], FirmwareSetpoint]]] = {
     6: (28, _decode_full_state),

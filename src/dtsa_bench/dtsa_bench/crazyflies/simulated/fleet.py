@@ -34,7 +34,7 @@ class _Link:
     """Socket and link faults of one vehicle."""
 
     socket: socket.socket | None
-    host: tuple[str, int] | None = None  # who sent last
+    host: tuple[str, int] | None = None  # of the last datagram
     drop_up: float = 0.0
     drop_down: float = 0.0
     frozen: bool = False
@@ -219,7 +219,7 @@ class Fleet:
             now = self.radio.now_ns() / 1e9
             for peer, receiver in zip(self.peers, self.radio.receivers, strict=True):
                 packets = list(peer.log_packets(self.tick, self.time)) if peer.blocks else ()
-                if packets and not receiver.connected(now):  # nobody is there: the log ends
+                if packets and not receiver.connected(now):  # no host is there: the log ends
                     peer.blocks.clear()
                     receiver.clear()
                 else:

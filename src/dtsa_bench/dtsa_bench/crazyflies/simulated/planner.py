@@ -10,7 +10,7 @@ Triple = tuple[float, float, float]
 IDLE = "idle"  # holds the motors off: nothing was ordered yet, a landing is over, or a streamed command took over
 FLYING = "flying"
 LANDING = "landing"
-DISABLED = "disabled"  # neither wants motors on nor off: somebody else gives set-points
+DISABLED = "disabled"  # neither wants motors on nor off: another source gives set-points
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,7 +42,7 @@ class FirmwareSupervisor:
         self.armed = auto_arming
         self.tumbled = False
         self.refuse_arming = False
-        self.crashed = False  # until somebody asks for recovery
+        self.crashed = False  # until recovery is requested
         self.emergency = ""  # why an emergency stop is in force; latches until a reboot
         self._watchdog: float | None = None  # time of the last watchdog packet
         self._thrust: float | None = None  # time of the last thrust

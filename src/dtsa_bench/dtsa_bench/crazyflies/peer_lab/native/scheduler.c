@@ -324,7 +324,7 @@ static void radio_task(void *argument)
         while (!pop_item(vehicle, &vehicle->radio_jobs, &job))
             wait_for(&vehicle->radio_jobs, false, NEVER);
         lab.event.kind = EVENT_HEARD;
-        lab.event.code = vehicle->callback ? job.packet.rssi : -1; // -1: nobody wants it
+        lab.event.code = vehicle->callback ? job.packet.rssi : -1; // -1: no callback
         lab.event.size = job.packet.size + 1;
         memcpy(lab.event.data, job.packet.raw, (size_t)job.packet.size + 1);
         yield_event();

@@ -131,7 +131,7 @@ class DongleModel:
         else:
             parts = [packet]
         if not self._can_send:
-            if self._ack:  # a Crazyradio 2.0 says that nobody has answered
+            if self._ack:  # a Crazyradio 2.0 reports that no answer came
                 self._finish(_Transfer(packet, answer, True), start, b"\0")
             return
         for part in parts:
@@ -146,7 +146,7 @@ class DongleModel:
         return frame.end_ns
 
     def _arrived(self, transfer: _Transfer, frame: OnAir, channel: int, rate: str, address: bytes) -> None:
-        """The packet has left the air: who has it?"""
+        """Find the receivers of a packet that has left the air."""
         heard = self._air.receivers_of(channel, frame)
         self.overheard(heard, address, transfer.packet, channel, rate, frame)
         seconds = frame.end_ns / 1e9

@@ -83,7 +83,7 @@ class RadioReceiver:
         return self._sent
 
     def receive_broadcast(self, packet: bytes, t: float) -> None:
-        """A packet to all came at t (s); nobody acknowledges it."""
+        """A packet to all came at t (s); it is not acknowledged."""
         self.on_packet(t)
         self._accept(packet, t)
 

@@ -151,7 +151,7 @@ class RadioServer:
             _send(host, struct.pack("<BI", DROPPED, dongle.sniffer.dropped))
 
     def unplug(self, number: int) -> None:
-        """Pull a dongle, of whoever has it."""
+        """Pull a dongle, whichever host has it."""
         self._gone.add(number)
         for host in self._hosts:
             if host.dongle == number:
