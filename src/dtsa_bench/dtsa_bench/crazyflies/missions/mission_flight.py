@@ -47,7 +47,7 @@ from .ground_station import GroundStation
 from .mission_record import MISSION_BAG
 from .places import APART_M, MissionError, check_places
 
-RECORDER_END_S = 10.0
+RECORDER_END_S = 30.0  # it gives way to all others
 BRIDGE_END_S = 40.0  # s, to land by itself and close the links
 
 

@@ -2,7 +2,7 @@
 
 Times are ns on the fleet's clock. A packet is on the air when the dongle is free of what came before; its answer goes
 to the host when it has left the air and USB has turned round. Sources: the documents and firmware of Crazyradio PA and
-Crazyradio 2.0 (compatible-usb-protocol.md, legacy_usb.c, c, radio.c).
+Crazyradio 2.0 (compatible-usb-protocol.md, legacy_usb.c, esb.c, radio.c).
 """
 
 from __future__ import annotations

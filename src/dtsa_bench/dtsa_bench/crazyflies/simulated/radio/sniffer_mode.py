@@ -1,8 +1,9 @@
 """Sniffer mode of a simulated Crazyradio 2.0: it hears all packets to two addresses, and sends without acknowledgement.
 
-Source: crazyradio2-firmware 5.4 (docs/development/compatible-usb-protocol.md, legacy_usb.c, c). One thread of the
-firmware does all: it waits for a packet that was heard, a tick longer than 1 ms at most, and only in between looks
-whether there is something to send. So the moment when a packet leaves is unknown. While it sends, its radio hears nothing.
+Source: crazyradio2-firmware 5.4 (docs/development/compatible-usb-protocol.md, legacy_usb.c, esb.c). One thread of the
+firmware does all: it waits for a packet that was heard, a tick longer than 1 ms at most, and only in between checks
+whether there is something to send. So the moment when a packet leaves is unknown. While it sends, its radio hears
+nothing.
 """
 
 from __future__ import annotations
