@@ -387,7 +387,8 @@ class DongleThread(threading.Thread):
         self._device.set_ack_enable(True)
 
     def _lose(self, why: str) -> None:
-        served = ", ".join(self._names.get(link.address.link, link.address.uri) for link in self._links)
+        links = {link.address.link for link in self._links}
+        served = ", ".join(name for link, name in self._names.items() if link in links)  # in the file's order
         self._report(
             "error", f"radio {self.radio} ({self._serial}) is gone ({why}): {served or 'no vehicle'} out of reach"
         )
