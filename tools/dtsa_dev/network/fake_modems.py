@@ -20,7 +20,7 @@ from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.serial.modems import MODEMS, Modem
+from dtsa_agent.air.serial_modems import MODEMS, Modem
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.medium import OnAir
 

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dtsa_agent.air.datagram import HEADER
-from dtsa_agent.air.process import wake_precisely
+from dtsa_agent.air.port import HEADER
 from dtsa_agent.core.frame import named_in
+from dtsa_agent.priority import wake_precisely
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
 from .hosts import Host, arrived

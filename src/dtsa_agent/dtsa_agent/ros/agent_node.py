@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
-from dtsa_agent.air.ports import AIRS
+from dtsa_agent.air.port import AIRS
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import MAX_AGENTS
 from dtsa_agent.core.settings.declaration import Setting

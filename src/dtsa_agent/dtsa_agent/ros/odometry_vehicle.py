@@ -19,8 +19,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from dtsa_agent.air.driver import LiveAgent
-from dtsa_agent.air.ports import make_settings, open_port, settings_class
+from dtsa_agent.air.driver import LiveAgent, Vehicle
+from dtsa_agent.air.port import open_port, settings_class
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
@@ -74,8 +74,8 @@ class VehicleSettings(Settings):
     )
 
 
-class OdometryVehicle:
-    """A vehicle that offers odometry and takes velocities; a :class:`~dtsa_agent.air.vehicle.Vehicle`.
+class OdometryVehicle(Vehicle):
+    """A vehicle that offers odometry and takes velocities; a :class:`~dtsa_agent.air.driver.Vehicle`.
 
     Odometry that cannot be, or lies where the vehicle cannot have got since the last one that was believed, is counted
     and not used. Without any for a while the vehicle gets the velocity 0, and the agent says that it stands.
@@ -112,7 +112,7 @@ class OdometryVehicle:
             self._feed.close()
             self._executor.shutdown(timeout_sec=0)
 
-    def ready(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether odometry has come, and is fresh."""
         self._update()
         return self._fresh() is not None
@@ -221,7 +221,7 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
     own = AgentSettings(id=agent, **declare_settings(node, AgentSettings, skip=("id",)))
     cls = settings_class(air)
     needed = {setting.name: "" for setting in settings_of(cls) if setting.required}  # an error if they are not given
-    chosen = make_settings(air, declare_settings(node, cls, defaults=needed))
+    chosen = cls.from_dict(declare_settings(node, cls, defaults=needed))
     settings = VehicleSettings.from_dict(declare_settings(node, VehicleSettings))
     vehicle = OdometryVehicle(node, settings, config.slot_s) if settings.vehicle == ODOMETRY else None
     out = str(declare_setting(node, _OUT))
@@ -230,7 +230,7 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
     logger = node.get_logger()
     try:
         with open_port(chosen) as port:
-            flying = LiveAgent(own, config, port, vehicle=vehicle, say=logger.warning)
+            flying = LiveAgent(own, config, port, vehicle=vehicle, log=logger.warning)
             with nullcontext() if record is None else record(out, flying, chosen) as recorder:
                 flying.run(stop)
             summary = flying.summary() if recorder is None else recorder.summary

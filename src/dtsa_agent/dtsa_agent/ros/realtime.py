@@ -58,9 +58,9 @@ from dtsa_agent.core.station import (
     check_joinable,
 )
 from dtsa_agent.core.swarm import PRESENT_LEAVING
+from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.priority import take_priority
 from dtsa_agent.ros.common.wire.checks import SIZES, SLOT, Unusable, check_start
 from dtsa_agent.ros.common.wire.messages import Fields, header_of
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
@@ -322,7 +322,7 @@ class RealtimeNode(AgentsNode):
         By turns of 0.1 s, as real-time priority has them, that would take minutes.
         """
         if self._priority:
-            take_priority(self._priority)
+            set_realtime(self._priority)
             self._priority = 0
 
     def _may_join(self) -> bool:

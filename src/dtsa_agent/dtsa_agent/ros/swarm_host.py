@@ -17,6 +17,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
 from dtsa_agent.core.settings.declaration import Setting, Settings, setting
 from dtsa_agent.keys import authenticator, with_key
+from dtsa_agent.priority import PrioritySettings, set_nice
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import (
     check_parameters,
@@ -27,7 +28,6 @@ from dtsa_agent.ros.common.graph.parameters import (
 )
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
-from dtsa_agent.ros.common.process.priority import PrioritySettings, give_way_by
 
 from .swarm_node import AgentsNode, SwarmNode
 
@@ -147,7 +147,7 @@ def _realtime(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, p
     if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):
         raise ConfigError("resume_at", places, f"{3 * count} numbers with a decimal point: x, y, z of each agent")
     if own.nice:
-        give_way_by(own.nice)
+        set_nice(own.nice)
     return RealtimeNode(
         node,
         config,

@@ -15,13 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from waiting import wait_for
 
-from dtsa_agent.air import device_port
-from dtsa_agent.air.crazyradio import CrazyradioPort, CrazyradioSettings, port
-from dtsa_agent.air.crazyradio.dongle import Dongle, DongleError
-from dtsa_agent.air.crazyradio.packets import BROADCAST, PacketReader, broadcast, datagram_in
-from dtsa_agent.air.crazyradio.stamps import DongleClock
-from dtsa_agent.air.datagram import check_fits, flight_ns, trust_ns
-from dtsa_agent.air.ports import make_settings
+from dtsa_agent.air import crazyradio_port, device_port
+from dtsa_agent.air.crazyradio_dongle import BROADCAST, PacketReader, SnifferDongle, broadcast, datagram_in
+from dtsa_agent.air.crazyradio_port import CrazyradioPort, DongleClock
+from dtsa_agent.air.device_port import DeviceError
+from dtsa_agent.air.port import check_fits, flight_ns, settings_class, trust_ns
+from dtsa_agent.air.settings import CrazyradioSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 
 URI = "radio://0/80/2M"
@@ -44,13 +43,13 @@ def heard(payload: bytes, stamp: int = 0, rssi: int = 45, pipe: int = 0) -> byte
 )
 def test_dongles_that_cannot_be_are_refused_by_name(field: str, values: dict[str, Any]) -> None:
     with pytest.raises(ConfigError) as error:
-        make_settings("crazyradio", values)
+        settings_class("crazyradio").from_dict(values)
     assert error.value.field == field
 
 
 def test_a_sealed_frame_fills_the_packet_and_others_have_room_for_two_bytes() -> None:
     properties = CrazyradioSettings(uri=URI).properties
-    assert SEALED.frame_length + properties.header(sealed=True).size == properties.longest
+    assert SEALED.frame_length + properties.header(signed=True).size == properties.longest
     check_fits(SEALED, properties)
     check_fits(SwarmConfig(agents=5, policy="lease", slot_ms=20.0), properties)
     slow = CrazyradioSettings(uri="radio://0/80/1M").properties
@@ -122,7 +121,7 @@ def test_arrivals_follow_the_stamps_whatever_usb_does(first_us: int, drift: floa
         if 100 < number < 300 or number > 400:
             worst = max(worst, abs(arrival - now - least))
     assert worst < 200 * US
-    assert clock.strange == 0
+    assert clock.unusable == 0
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 2**40)), min_size=1, max_size=50))
@@ -139,7 +138,7 @@ def test_a_wrong_stamp_does_not_move_the_clock_and_a_dongle_that_began_anew_does
         now += 10 * MS
         assert clock.arrival_ns(400_000_000 + 10_000 * k, now) == now
     assert clock.arrival_ns(523_456_789, now + 1) == now + 1
-    assert clock.strange == 1
+    assert clock.unusable == 1
     now += 10 * MS
     assert clock.arrival_ns(401_000_000, now + 3 * MS) == pytest.approx(now, abs=2 * US)
     for k in range(3):
@@ -209,7 +208,7 @@ def usb_error(number: int) -> Any:
 def test_a_dongle_is_told_channel_rate_address_and_mode(plugged: list[Any]) -> None:
     device = FakeDevice()
     plugged.append(device)
-    dongle = Dongle(CrazyradioSettings(uri="radio://51d0000000/42/1M"))
+    dongle = SnifferDongle(CrazyradioSettings(uri="radio://51d0000000/42/1M"))
     assert device.requests == [(0x24, 0, b""), (0x01, 42, b""), (0x03, 1, b""), (0x02, 0, BROADCAST), (0x24, 1, b"")]
     dongle.write(broadcast(bytes(60), 7))
     dongle.write(broadcast(bytes(57), 7))
@@ -229,7 +228,7 @@ def test_dongles_that_cannot_be_used_are_one_line(plugged: list[Any], device: An
     if device is not None:
         plugged.append(device)
     with pytest.raises(ConfigError) as error:
-        Dongle(CrazyradioSettings(uri=URI))
+        SnifferDongle(CrazyradioSettings(uri=URI))
     assert error.value.field == "uri"
     assert allowed in str(error.value)
     assert "\n" not in str(error.value)
@@ -238,7 +237,7 @@ def test_dongles_that_cannot_be_used_are_one_line(plugged: list[Any], device: An
 def test_without_pyusb_a_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="pip install pyusb"):
-        Dongle(CrazyradioSettings(uri=URI))
+        SnifferDongle(CrazyradioSettings(uri=URI))
 
 
 def test_what_a_dongle_hears_reaches_the_port_and_what_others_say_is_counted(plugged: list[Any]) -> None:
@@ -259,14 +258,14 @@ def test_what_a_dongle_hears_reaches_the_port_and_what_others_say_is_counted(plu
 
 
 def test_a_dongle_that_was_unplugged_is_used_again(plugged: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_port, "_LOOK_S", 0.01)
-    monkeypatch.setattr(port, "_SECOND", 0)  # counts are asked for all the time
+    monkeypatch.setattr(device_port, "_RETRY_S", 0.01)
+    monkeypatch.setattr(crazyradio_port, "_COUNTS_NS", 0)  # counts are asked for all the time
     device = FakeDevice()
     device.dropped = 2
     plugged.append(device)
     said: list[str] = []
     with CrazyradioPort(CrazyradioSettings(uri=URI)) as opened:
-        opened.say = said.append
+        opened.log = said.append
         wait_for(lambda: opened.counts()["dropped_by_dongle"] == 2)
         plugged.clear()
         device.errors["read"] = device.errors["write"] = device.errors["ctrl_transfer"] = usb_error(errno.ENODEV)
@@ -290,6 +289,6 @@ def test_a_dongle_that_does_not_take_a_packet_is_a_refusal(plugged: list[Any]) -
     plugged.append(device)
     with CrazyradioPort(CrazyradioSettings(uri=URI)) as opened:
         assert "it does not" in opened.send(b"mine")
-    with pytest.raises(DongleError):
-        Dongle(CrazyradioSettings(uri=URI)).write(b"x")
+    with pytest.raises(DeviceError):
+        SnifferDongle(CrazyradioSettings(uri=URI)).write(b"x")
     assert "crazyradio" not in {thread.name for thread in threading.enumerate()}

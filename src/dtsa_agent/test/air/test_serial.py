@@ -14,13 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from waiting import wait_for
 
-from dtsa_agent.air.datagram import check_fits, flight_ns, shortest_slot_ns
-from dtsa_agent.air.port import ReceivedDatagram
-from dtsa_agent.air.serial.frames import LineReader, to_line
-from dtsa_agent.air.serial.lengths import LONGEST, OVERHEAD
-from dtsa_agent.air.serial.modems import MODEMS, lora_ns
-from dtsa_agent.air.serial.port import SerialPort
-from dtsa_agent.air.serial.settings import SerialSettings
+from dtsa_agent.air.port import ReceivedDatagram, check_fits, flight_ns, shortest_slot_ns
+from dtsa_agent.air.serial_modems import LONGEST, MODEMS, OVERHEAD, lora_ns
+from dtsa_agent.air.serial_port import LineReader, SerialPort, to_line
+from dtsa_agent.air.settings import SerialSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 
 DATAGRAMS = st.binary(min_size=1, max_size=LONGEST)
@@ -82,7 +79,7 @@ def test_bytes_without_end_are_not_kept() -> None:
     for _ in range(1000):
         assert not list(reader.feed(b"x" * 4096))
     assert reader.garbled_bytes > 4_000_000
-    assert len(reader._begun) <= LONGEST + 10
+    assert len(reader._piece) <= LONGEST + 10
     assert [datagram for datagram, _ in reader.feed(to_line(b"again"))] == [b"again"]
 
 
@@ -160,7 +157,7 @@ def heard(port: SerialPort, count: int) -> list[ReceivedDatagram]:
 def test_a_port_gives_what_it_is_given_and_knows_an_echo(line: Line) -> None:
     with SerialPort(SerialSettings(device=str(line.path))) as port:
         said: list[str] = []
-        port.say = said.append
+        port.log = said.append
         assert port.send(b"own") == ""
         wait_for(lambda: os.read(line.master, 100) == to_line(b"own"))
         os.write(line.master, b"garb" + to_line(b"other") + to_line(b"own"))
@@ -185,7 +182,7 @@ def test_a_device_has_one_user(line: Line) -> None:
 def test_a_device_that_is_unplugged_comes_back(line: Line) -> None:
     with SerialPort(SerialSettings(device=str(line.path))) as port:
         said: list[str] = []
-        port.say = said.append
+        port.log = said.append
         line.unplug()
         wait_for(lambda: bool(said))
         assert port.send(b"lost") == "the device is not there"
@@ -211,7 +208,7 @@ def test_a_line_that_takes_nothing_holds_nobody_up(line: Line) -> None:
 def test_a_line_that_carries_something_else_is_told_once(line: Line, content: bytes, why: str) -> None:
     with SerialPort(SerialSettings(device=str(line.path))) as port:
         said: list[str] = []
-        port.say = said.append
+        port.log = said.append
         for _ in range(20):
             os.write(line.master, content * (500 // len(content)))
         wait_for(lambda: bool(said))

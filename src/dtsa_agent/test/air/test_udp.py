@@ -17,19 +17,17 @@ from unittest.mock import DEFAULT, MagicMock
 
 import pytest
 
-from dtsa_agent.air.datagram import link_of
 from dtsa_agent.air.driver import LiveAgent
-from dtsa_agent.air.port import ClockMap, ReceivedDatagram
-from dtsa_agent.air.process import going_first
-from dtsa_agent.air.record import SlotRecord
+from dtsa_agent.air.port import ClockMap, ReceivedDatagram, link_of
+from dtsa_agent.air.record import AgentCounts, SlotRecord
 from dtsa_agent.air.reports import Reports
-from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.tally import Tally
-from dtsa_agent.air.udp import UdpPort, UdpSettings
+from dtsa_agent.air.settings import AgentSettings, UdpSettings
+from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, Frame, Swarm, SwarmConfig, encode_frame
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.station import BETWEEN, FLIES, Station, StationSettings
+from dtsa_agent.priority import realtime_thread
 from dtsa_agent.stop import Stop
 
 SLOT_NS = 10_000_000
@@ -136,12 +134,12 @@ STATUS = SimpleNamespace(
 )
 
 
-def test_the_tally_knows_how_late_frames_left() -> None:
-    tally = Tally()
-    assert tally.summary(STATUS, (0, 0))["sends_on_time_share"] is None
+def test_the_counts_knows_how_late_frames_left() -> None:
+    counts = AgentCounts()
+    assert counts.summary(STATUS, (0, 0))["sends_on_time_share"] is None
     for late in (0, 50_000, 60_000, 3_000_000):
-        tally.sent(late)
-    found = tally.summary(SimpleNamespace(**vars(STATUS) | {"sent": 4}), (0, 0))
+        counts.add_sent(late)
+    found = counts.summary(SimpleNamespace(**vars(STATUS) | {"sent": 4}), (0, 0))
     assert found["sends_on_time_share"] == 0.75
     assert found["send_late_ms"] == {"p50": pytest.approx(0.05, rel=0.05), "p99": 3.0, "max": 3.0}
 
@@ -164,7 +162,7 @@ def test_what_the_network_refuses_does_not_count_as_sent(monkeypatch: pytest.Mon
     udp = UdpSettings(interface="lo", group=f"239.255.79.79:{20_000 + os.getpid() % 10_000}")
     config = SwarmConfig(agents=2, policy="tdma")
     slots: list[SlotRecord] = []
-    watcher = SimpleNamespace(slot=slots.append, other=lambda *unused: None)
+    watcher = SimpleNamespace(slot=slots.append, refused=lambda *unused: None)
     with UdpPort(udp) as port, Stop() as stop:
         agent = LiveAgent(AgentSettings(id=1, duration_s=0.8), config, port, watcher)
         refusing = MagicMock(wraps=port._out)
@@ -219,7 +217,7 @@ def test_other_settings_and_another_key_are_said_in_flight() -> None:
 
 def test_an_agent_goes_first_and_what_it_starts_does_not() -> None:
     before = os.sched_getscheduler(0)
-    with going_first(3) as problem:
+    with realtime_thread(3) as problem:
         if problem:
             pytest.skip(problem)
         assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR
@@ -227,17 +225,17 @@ def test_an_agent_goes_first_and_what_it_starts_does_not() -> None:
         says = [sys.executable, "-c", "import os; print(os.sched_getscheduler(0))"]
         assert int(subprocess.check_output(says)) == os.SCHED_OTHER
     assert os.sched_getscheduler(0) == before
-    with going_first(0) as problem:
+    with realtime_thread(0) as problem:
         assert (problem, os.sched_getscheduler(0)) == ("", before)
 
 
 def test_the_share_of_agents_heard_counts_from_when_it_could_fly() -> None:
-    tally = Tally()
-    found = tally.summary(STATUS, (0, 0))
+    counts = AgentCounts()
+    found = counts.summary(STATUS, (0, 0))
     assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (None, None, None)
     for hears in (2, 1):
-        tally.look(2, hears)
-    found = tally.summary(STATUS, (63, 3))
+        counts.add_contacts(2, hears)
+    found = counts.summary(STATUS, (63, 3))
     assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (0.75, 63, 3)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 PRIORITY = """
 import os, resource, sys, threading
-from dtsa_agent.ros.common.process.priority import give_way, stay_on_one_processor, take_priority
+from dtsa_agent.priority import set_ordinary_thread, use_last_processor, set_realtime
 if len(sys.argv) > 1:  # an ordinary user with that limit
     resource.setrlimit(resource.RLIMIT_RTPRIO, (int(sys.argv[1]),) * 2)
     os.setgroups([])
@@ -19,12 +19,12 @@ if len(sys.argv) > 1:  # an ordinary user with that limit
     os.setuid(65534)
 over = threading.Event()
 threading.Thread(target=over.wait).start()
-why = take_priority(7)
+why = set_realtime(7)
 policies = {os.sched_getscheduler(int(task)) for task in os.listdir("/proc/self/task")}
 assert why or policies == {os.SCHED_RR}, policies
-stay_on_one_processor()
+use_last_processor()
 assert {len(os.sched_getaffinity(int(task))) for task in os.listdir("/proc/self/task")} == {1}
-give_way()
+set_ordinary_thread()
 assert os.sched_getscheduler(0) == os.SCHED_OTHER
 over.set()
 print(why)

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     parser.usage = "%(prog)s [OPTIONS]"
     parser.add_argument("bags", nargs="*", help=argparse.SUPPRESS)
-    from dtsa_agent.air.ports import AIRS
+    from dtsa_agent.air.port import AIRS
 
     parser.add_argument("--air", choices=(_ROS, *AIRS), help="what carries the swarm's frames [ros]")
     parser.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the swarm")

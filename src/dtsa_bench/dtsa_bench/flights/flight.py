@@ -39,12 +39,12 @@ from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.station import check_joinable, check_slotted
 from dtsa_agent.keys import check_key
+from dtsa_agent.priority import set_nice, set_realtime, set_realtime_or_nice
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.graph.parameters import to_parameters
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.process.priority import give_way_by, take_place, take_priority
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 from dtsa_agent.stop import StopToken
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
@@ -231,7 +231,9 @@ def _fly(
 def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: FlightProgress, priority: int) -> None:
     """The flight itself; the channel is closed afterwards."""
     # Before its agents, and both before all else if that is allowed.
-    first = isinstance(channel, RealtimeChannel) and not take_place(priority and priority + 1, CHANNEL_NICE, False)
+    first = isinstance(channel, RealtimeChannel) and not set_realtime_or_nice(
+        priority and priority + 1, CHANNEL_NICE, False
+    )
     try:
         channel.run(ended)
         shown.show()
@@ -242,8 +244,8 @@ def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: Fl
             channel.close()
         finally:
             if first and not ended.stop:  # who has been told to end does so before all else
-                take_priority(0)
-                give_way_by(0)
+                set_realtime(0)
+                set_nice(0)
 
 
 def _cut_short(channel: Any, ended: StopToken, failure: DtsaError | None) -> dict[str, str]:

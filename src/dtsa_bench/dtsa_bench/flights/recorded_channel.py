@@ -16,11 +16,11 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.config import agreed_settings
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 from dtsa_agent.keys import check_key
+from dtsa_agent.priority import PrioritySettings, set_realtime
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings, swarm_wide_node
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import ending, run_node
-from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
 from dtsa_agent.ros.common.process.runs import Run
 from dtsa_bench.drawing import optional_picture
 from dtsa_bench.runs.config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
@@ -155,7 +155,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s, space=space)
         try:
             if run.mode != LOCKSTEP:
-                take_priority(first)
+                set_realtime(first)
             flight.channel.run(stop)
         finally:
             flight.channel.close()

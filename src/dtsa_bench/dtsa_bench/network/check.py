@@ -7,10 +7,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtsa_agent.air.datagram import link_of
-from dtsa_agent.air.port import PortProperties
+from dtsa_agent.air.driver import Vehicle
+from dtsa_agent.air.port import PortProperties, link_of
 from dtsa_agent.air.record import SlotRecord
-from dtsa_agent.air.vehicle import SimulatedVehicle
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.frame import condition_in
 from dtsa_agent.core.station import BETWEEN, StationSettings
@@ -35,7 +34,7 @@ def _settled_after(config: SwarmConfig) -> int:
     return (2 * config.main_every if config.policy_row.probation else 1) * config.agents
 
 
-class HeldVehicle(SimulatedVehicle):
+class HeldVehicle(Vehicle):
     """A vehicle that stays where it is, whatever its agent wants; it is never at its goal, so that all speak alike."""
 
     def sense(self, swarm: Swarm) -> None:
@@ -80,7 +79,7 @@ class Check:
 
     def slot(self, record: SlotRecord) -> None:
         """A slot is over."""
-        if record.anew:  # another time: what was heard before counts its slots differently
+        if record.is_first:  # another time: what was heard before counts its slots differently
             self._others.clear()
             self._slots = 0
         self._slots, self._last = self._slots + 1, record.slot
@@ -112,7 +111,7 @@ class Check:
             if agent != parsed.sender and hears is not None:
                 other.says[agent] = other.says.get(agent, 0) + (1 if hears else -1)
 
-    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
+    def refused(self, reason: str, data: bytes, arrival_ns: int) -> None:
         """A datagram has not been taken in.
 
         :param data: its bytes.

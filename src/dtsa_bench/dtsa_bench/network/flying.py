@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dtsa_agent.air.driver import LiveAgent
-from dtsa_agent.air.port import PortSettings
-from dtsa_agent.air.ports import open_port
+from dtsa_agent.air.port import PortSettings, open_port
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.stop import Stop
@@ -46,7 +45,7 @@ def check(job: AgentJob, seconds: float) -> int:
     say(f"checks for {duration:.0f} s who is heard; its vehicle is held")
     watcher = Check(own.id, job.config, job.port.properties)
     with Stop() as stop, open_port(job.port) as port:
-        LiveAgent(own, job.config, port, watcher, HeldVehicle(), say=say).run(stop)
+        LiveAgent(own, job.config, port, watcher, HeldVehicle(), log=say).run(stop)
     result = watcher.result()
     print(json.dumps(result, indent=2) + "\n" if job.as_json else table(result), end="")
     if result["missing"]:
@@ -64,7 +63,7 @@ def fly(job: AgentJob) -> int:
     terminal = _Terminal(job.own.id)
     say = terminal.say
     with Stop() as stop, open_port(job.port) as port:
-        agent = LiveAgent(job.own, job.config, port, say=say, show=terminal.show if sys.stderr.isatty() else None)
+        agent = LiveAgent(job.own, job.config, port, log=say, show=terminal.show if sys.stderr.isatty() else None)
         if job.out is None:
             agent.run(stop)
             summary = agent.summary()

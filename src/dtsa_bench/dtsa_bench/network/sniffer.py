@@ -11,9 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.datagram import frame_in, link_of
-from dtsa_agent.air.port import PortSettings
-from dtsa_agent.air.ports import open_listener
+from dtsa_agent.air.port import PortSettings, frame_in, link_of, open_port
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.station import OTHER_TIME, REPEATED, StationSettings
@@ -53,8 +51,8 @@ class Sniffer:
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
         self._zero_ns = time.monotonic_ns()
-        self._listener: Any = open_listener(port)
-        self._listener.say = say
+        self._listener: Any = open_port(port)
+        self._listener.log = say
         about = {"port": dataclasses.asdict(port.properties), "port_settings": port.to_dict(), "zero_ns": self._zero_ns}
         try:
             self.bag = None if path is None else RecordFile(path, config, {SNIFFER: json.dumps(about, sort_keys=True)})

@@ -16,9 +16,8 @@ import serial
 from dtsa_dev.network.fake_modems import FakeModems, FakeModemSettings
 from waiting import wait_for
 
-from dtsa_agent.air.serial import SerialSettings
-from dtsa_agent.air.serial.frames import to_line
-from dtsa_agent.air.serial.port import SerialPort
+from dtsa_agent.air.serial_port import SerialPort, to_line
+from dtsa_agent.air.settings import SerialSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import read

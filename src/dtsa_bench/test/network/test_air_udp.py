@@ -20,8 +20,8 @@ from rosbags.rosbag2 import Reader
 from waiting import wait_for
 
 import dtsa
-from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import UdpPort, UdpSettings
+from dtsa_agent.air.settings import AgentSettings, UdpSettings
+from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.commands.cli import main

@@ -27,11 +27,11 @@ from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.crazyflie.state import Vector, rotate
 from dtsa_agent.keys import authenticator
+from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, swarm_wide_node
 from dtsa_agent.ros.common.process.loop import Feed, Stop
 from dtsa_agent.ros.common.process.node_process import run_node
-from dtsa_agent.ros.common.process.priority import take_priority
 from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, OnePublisher, Unusable, check_odometry
 from dtsa_agent.ros.common.wire.messages import Fields
 from dtsa_agent.ros.realtime import RealtimeNode
@@ -210,7 +210,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         config = declare_swarm(node)
         ids = declare_ids(node, config.agents)
         station = StationNodeSettings(**declare_settings(node, StationNodeSettings))
-        take_priority(station.priority)
+        set_realtime(station.priority)
         check_parameters(node)
         vehicles = station.vehicles.split() or [f"cf{k}" for k in range(1, config.agents + 1)]
         if len(vehicles) != config.agents:

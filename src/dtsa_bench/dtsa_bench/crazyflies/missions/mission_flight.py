@@ -20,11 +20,11 @@ from dtsa_agent.core.station import check_slotted
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.keys import check_key
+from dtsa_agent.priority import avoid_last_processor, set_ordinary_thread, set_realtime
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import to_parameters
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.process.priority import give_way, leave_that_processor, take_priority
 from dtsa_agent.stop import StopToken
 from dtsa_bench.flights.children import Children, NodeError, describe_end
 from dtsa_bench.flights.domain import LAST_DOMAIN, ros_domain
@@ -105,13 +105,13 @@ class _Station:
 
         :returns: the run with these places, the mission.
         """
-        leave_that_processor()
+        avoid_last_processor()
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
         mission = self._mission = Mission(node, self.settings, scenario, ended, self.progress.show)
         mission.bridge_alive = mission.check_bridge if self._attach else self.bridge.check
         mission.start()
-        take_priority(below(self.settings.station.priority, 1))
+        set_realtime(below(self.settings.station.priority, 1))
         mission.connect()
         swarm = mission.find_places(run.swarm)
         if swarm != run.swarm:
@@ -263,7 +263,7 @@ def _exchange(
                 mission.order_landing()  # before the agents end: nobody flies on without them
             agents.stop()
             mission.land(urgent)
-        give_way()  # the bridge does not: it has to watch them
+        set_ordinary_thread()  # the bridge does not: it has to watch them
         pictures = options.pictures and not ended
         summary = flight.write_results(
             pictures,

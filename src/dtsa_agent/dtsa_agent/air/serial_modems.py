@@ -1,4 +1,4 @@
-"""Modems by name: how long a packet is on the air, and what a modem adds to that. None was ever measured here.
+"""Serial modems by name: how long a packet is on the air, and what a modem adds to that. None was ever measured here.
 
 A row is all that differs; the port, the simulated modem and the channel's table of radios are made from it. Figures
 that makers do not publish are assumed, and the row says so.
@@ -12,6 +12,10 @@ from dataclasses import dataclass
 _SECOND = 1_000_000_000
 _MS = 1_000_000
 NONE = "none"
+OVERHEAD = 5  # bytes around a datagram on the line: two zeros, the byte of COBS, the check sum
+HEADER = 8  # bytes of a datagram before its frame: two of the settings, two of times, four of one heard agent
+FRAMING = HEADER + OVERHEAD  # bytes around a frame
+LONGEST = 250  # bytes of a datagram
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,25 +35,16 @@ class Modem:
 
 
 def _bits(bitrate: int, overhead_bytes: int, fixed_ns: int = 0) -> Callable[[int], int]:
-    """Time on the air of a radio that sends bytes one after the other.
-
-    :param bitrate: bit/s.
-    :param overhead_bytes: around those of a packet.
-    :param fixed_ns: ns that any packet takes.
-    """
+    """Time on the air of a radio that sends bytes one after the other, some around those of a packet."""
     return lambda length: fixed_ns - (-(overhead_bytes + length) * 8 * _SECOND // bitrate)
 
 
 def lora_ns(length: int, *, spreading: int, bandwidth_hz: int, coding: int = 1, preamble: int = 0) -> int:
     """Time of a LoRa packet on the air, ns: Semtech's formula, with explicit header and check sum.
 
-    Source: SX1261/2 data sheet, 6.1.4 (LoRa time on air).
-
-    :param length: bytes.
-    :param spreading: spreading factor, 5 to 12.
-    :param bandwidth_hz: Hz.
-    :param coding: of each four bits so many more are sent, 1 to 4.
-    :param preamble: symbols; 0: as the data sheet recommends, 12 for spreading factors 5 and 6, else 8.
+    Source: SX1261/2 data sheet, 6.1.4 (LoRa time on air). ``length`` is in bytes, ``spreading`` the factor of 5 to 12;
+    of each four bits ``coding`` more are sent, 1 to 4. ``preamble`` is in symbols; 0: as the data sheet recommends, 12
+    for spreading factors 5 and 6, else 8.
     """
     few = spreading < 7
     preamble = preamble or (12 if few else 8)

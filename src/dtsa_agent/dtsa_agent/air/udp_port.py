@@ -1,4 +1,4 @@
-"""A multicast group on one network interface, with the kernel's times of arrival."""
+"""A multicast group on one network interface as the port of an agent, with the kernel's times of arrival."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
-from dtsa_agent.air.port import ClockMap, ReceivedDatagram
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.station import Station
 
+from .port import ClockMap, ReceivedDatagram
 from .settings import UdpSettings
 
 _SIOCGIFADDR = 0x8915
 _IP_RECVERR = 11
 _IP_MULTICAST_ALL = 49  # Linux: 0: only groups that this socket has joined
 _SO_TIMESTAMPNS = 35
-_LOOK_NS = 1_000_000_000  # a listener looks this often whether its interface is still the same
+_CHECK_NS = 1_000_000_000  # from one check whether the interface is still the same to the next
 
 
-class Place(NamedTuple):
-    """Where an interface is now: both change when it is made anew or gets another address."""
+class InterfaceState(NamedTuple):
+    """An interface now: both change when it is made anew or gets another address."""
 
     number: int  # that the kernel gives the interface
     address: str  # IPv4
@@ -44,16 +44,16 @@ class UdpPort:
     def __init__(self, settings: UdpSettings) -> None:
         self._settings, self._group, self.properties = settings, settings.address, settings.properties
         group, port = self._group
-        place = _place(settings)
+        state = _state_of(settings)
         self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._reader = ffi.new("socket_reader *")
         lib.socket_start(self._reader, self._in.fileno())
         self.interface_changes = 0  # how often the group was joined again
-        self.say: Callable[[str], None] | None = None  # is told a line when the interface goes, and when it is back
-        self._place: Place | None = None  # by which the group is joined; None: the interface has gone
+        self.log: Callable[[str], None] | None = None
+        self._state: InterfaceState | None = None  # by which the group is joined; None: the interface has gone
         self._membership = b""
-        self._look_ns = time.monotonic_ns() + _LOOK_NS
+        self._check_due_ns = time.monotonic_ns() + _CHECK_NS
         try:
             self._in.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._in.bind(self._group)
@@ -61,18 +61,18 @@ class UdpPort:
             with suppress(OSError):  # arrivals are then as exact as this process is quick
                 self._in.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
             self._in.setblocking(False)
-            self._join(place)
+            self._join(state)
         except OSError as error:
             self.close()
             where = f"{settings.interface}, group {group}:{port}"
             raise ConfigError("interface", where, f"one that takes part in the group ({error.strerror})") from None
 
-    def _join(self, place: Place) -> None:
-        """Joins the group, and sends to it, by an interface as it is now."""
-        membership = struct.pack("=4s4si", socket.inet_aton(self._group[0]), b"\0\0\0\0", place.number)
+    def _join(self, state: InterfaceState) -> None:
+        """Join the group, and send to it, by an interface as it is now."""
+        membership = struct.pack("=4s4si", socket.inet_aton(self._group[0]), b"\0\0\0\0", state.number)
         out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # a bound socket cannot get another address
         try:
-            out.bind((place.address, 0))
+            out.bind((state.address, 0))
             out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, membership)
             out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, self._settings.ttl)
             out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
@@ -86,41 +86,41 @@ class UdpPort:
             out.close()
             raise
         self._out.close()
-        self._out, self._membership, self._place = out, membership, place
+        self._out, self._membership, self._state = out, membership, state
         address, number = out.getsockname()  # from which it sends
         self._reader.address, self._reader.port = socket.inet_aton(address), number
 
-    def look(self) -> bool:
-        """Joins the group again if the interface is another one than before; whether that was so."""
+    def check_interface(self) -> bool:
+        """Join the group again if the interface is another one than before; return whether that was so."""
         try:
-            place = _place(self._settings)
+            state = _state_of(self._settings)
         except ConfigError:
-            if self._place is not None:
-                self._tell("has gone, or has no address: no frame leaves or arrives until it is back")
-            self._place = None
+            if self._state is not None:
+                self._print("has gone, or has no address: no frame leaves or arrives until it is back")
+            self._state = None
             return False
-        if place == self._place:
+        if state == self._state:
             return False
         try:
-            self._join(place)
+            self._join(state)
         except OSError:  # it is not ready yet
             return False
         self.interface_changes += 1
-        self._tell(f"is another one now (number {place.number}, address {place.address}): joined the group again")
+        self._print(f"is another one now (number {state.number}, address {state.address}): joined the group again")
         return True
 
-    def _tell(self, what: str) -> None:
-        if self.say is not None:
-            self.say(f"interface {self._settings.interface} {what}")
+    def _print(self, text: str) -> None:
+        if self.log is not None:
+            self.log(f"interface {self._settings.interface} {text}")
 
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
         return self._in.fileno()
 
     def send(self, data: bytes) -> str:
-        """Sends to the group at once; why the network has not taken it, or an empty text."""
+        """Send to the group at once; return why the network has refused it, or an empty text."""
         refusal = self._send(data)
-        return self._send(data) if refusal and self.look() else refusal
+        return self._send(data) if refusal and self.check_interface() else refusal
 
     def _send(self, data: bytes) -> str:
         try:
@@ -130,29 +130,26 @@ class UdpPort:
         return ""
 
     def receive(self, most: int) -> list[ReceivedDatagram]:
-        """What has arrived, in this order; empty if nothing has."""
-        self._look_in_time()
-        count = lib.socket_read(self._reader, most)
-        return [
-            ReceivedDatagram(bytes(ffi.buffer(one.data, one.length)), one.arrival_ns, bool(one.own))
-            for one in (self._reader.datagrams[k] for k in range(count))
-        ]
+        """Return what has arrived, in this order; empty if nothing has."""
+        self._check_in_time()
+        datagrams = (self._reader.datagrams[k] for k in range(lib.socket_read(self._reader, most)))
+        return [ReceivedDatagram(bytes(ffi.buffer(d.data, d.length)), d.arrival_ns, bool(d.own)) for d in datagrams]
 
     def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
-        """Hand what has arrived, but for its own, to a station; returns how many datagrams have, so many at most."""
-        self._look_in_time()
+        """Hand what others have sent to a station; return how many datagrams have arrived, at most so many."""
+        self._check_in_time()
         count: int = lib.socket_deliver(self._reader, most, station.c, clock.offset_ns, clock.drift_ppb, clock.began_ns)
         station.raise_fault()
         return count
 
-    def _look_in_time(self) -> None:
+    def _check_in_time(self) -> None:
         now = time.monotonic_ns()
-        if now >= self._look_ns:
-            self._look_ns = now + _LOOK_NS
-            self.look()
+        if now >= self._check_due_ns:
+            self._check_due_ns = now + _CHECK_NS
+            self.check_interface()
 
     def counts(self) -> dict[str, int]:
-        """Failed reads, how often the clock has been set, and how often the interface was another one."""
+        """Return failed reads, how often the clock has been set, and how often the interface was another one."""
         return {
             "unreadable": self._reader.unreadable,
             "clock_steps": self._reader.clock_steps,
@@ -160,7 +157,7 @@ class UdpPort:
         }
 
     def close(self) -> None:
-        """Leaves the group."""
+        """Leave the group."""
         self._in.close()
         self._out.close()
 
@@ -171,18 +168,11 @@ class UdpPort:
         self.close()
 
 
-def _place(settings: UdpSettings) -> Place:
-    return Place(settings.interface_index(), interface_address(settings.interface))
-
-
-def interface_address(name: str) -> str:
-    """The IPv4 address of a network interface.
-
-    :raises ConfigError: if it has none.
-    """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+def _state_of(settings: UdpSettings) -> InterfaceState:
+    name, number = settings.interface, settings.interface_index()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as query:
         try:
-            answer = fcntl.ioctl(asked, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+            answer = fcntl.ioctl(query, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
         except OSError:
             raise ConfigError("interface", name, "one with an IPv4 address") from None
-    return socket.inet_ntoa(answer[20:24])
+    return InterfaceState(number, socket.inet_ntoa(answer[20:24]))

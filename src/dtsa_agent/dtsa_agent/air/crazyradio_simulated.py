@@ -19,7 +19,7 @@ import usb.core
 
 from dtsa_agent.core.errors import ConfigError
 
-from .packets import FIRST_FIRMWARE, GET_SNIFFER_DROP_COUNT, SET_RADIO_MODE, SNIFFER, VENDOR_IN, VENDOR_OUT
+from .crazyradio_dongle import FIRST_FIRMWARE, GET_SNIFFER_DROP_COUNT, SET_RADIO_MODE, SNIFFER, VENDOR_IN, VENDOR_OUT
 
 LIST, CLAIM, REQUEST, PACKET, READ, DROPPED = range(6)
 VENDOR = 0x1915
