@@ -71,8 +71,8 @@ setup(
             libraries=["m"],
         ),
         Extension(
-            "dtsa_agent.ros.common.workarounds._endless",
-            sources=["dtsa_agent/ros/common/workarounds/_endless.c"],
+            "dtsa_agent.ros.common._endless",
+            sources=["dtsa_agent/ros/common/_endless.c"],
             py_limited_api=True,
         ),
     ],

@@ -16,8 +16,8 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Report
 from rclpy.serialization import serialize_message
 
-from dtsa_agent.ros.common.wire.checks import Unusable
-from dtsa_agent.ros.common.wire.messages import Fields, read_report
+from dtsa_agent.ros.common.checks import BadMessage
+from dtsa_agent.ros.common.messages import Fields, read_report
 from dtsa_channel_sim.ros.answers import Accounts, Delivered
 
 AGENTS, STEPS, LATEST = 5, 1, 50
@@ -71,7 +71,7 @@ def test_a_report_fills_accounts_and_only_what_was_delivered_counts_as_taken_in(
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_and_changes_nothing(field: str, values: Any, reason: str) -> None:
     made = accounts()
-    with pytest.raises(Unusable) as caught:
+    with pytest.raises(BadMessage) as caught:
         made.add(report(**{field: values}), LATEST)
     assert caught.value.reason == reason
     assert made.silent(7) is None
@@ -89,7 +89,7 @@ def test_no_report_does_anything_but_fit_or_be_refused(changed: dict[str, list[i
     kinds = {"agent": "H", "slot": "I", "offset_ns": "q", "chosen": "H", "track": "d", "goal": "d", "heard_slot": "I"}
     fields = {name: array(kinds.get(name, "B"), values) for name, values in changed.items()}
     made = accounts()
-    with suppress(Unusable):  # any other error would end the channel
+    with suppress(BadMessage):  # any other error would end the channel
         made.add(report(**fields), LATEST)
     for slot in range(LATEST + 1):
         made.taken_in(slot)

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.stop import Stop
 
 
 def _signalled(stop: Stop) -> None:

@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         history = RunHistory(settings.where)
         source = NetworkListener(history, config, settings)
     else:
-        from dtsa_agent.ros.common.graph import names
+        from dtsa_agent.ros.common import names
         from dtsa_bench.pages.view.graph import GraphSource
 
         domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common import names
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import make_clocks
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common.process.node_process import SUPERVISOR
+from dtsa_agent.ros.common.node_process import SUPERVISOR
 
 # A process group of its own; Python 3.10 cannot say so without a function that runs in the child.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}

@@ -40,13 +40,11 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.station import check_joinable, check_slotted
 from dtsa_agent.keys import check_key
 from dtsa_agent.priority import set_nice, set_realtime, set_realtime_or_nice
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.graph.parameters import to_parameters
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
-from dtsa_agent.stop import StopToken
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.names import agent_names
+from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
+from dtsa_agent.ros.common.parameters import to_parameters
+from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.metrics import may_share
 from dtsa_bench.runs.options import new_directory
@@ -272,7 +270,7 @@ def _start_agents(
             raise KeyboardInterrupt
         own, name, module = dict(process.parameters), f"cf{process.ids[0]}", "dtsa_agent.ros.agent_node"
         if process.executable == "swarm_host":
-            name, module = f"{process.node} with {named(process.ids)}", "dtsa_agent.ros.swarm_host"
+            name, module = f"{process.node} with {agent_names(process.ids)}", "dtsa_agent.ros.swarm_host"
             own["shared_table"] = run.mode == LOCKSTEP and may_share(run)
         words = [*common, "-r", f"__ns:={process.namespace}", "-r", f"__node:={process.node}"]
         words += [word for key, value in own.items() for word in ("-p", f"{key}:={json.dumps(value)}")]

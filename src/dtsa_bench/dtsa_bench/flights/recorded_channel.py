@@ -17,11 +17,11 @@ from dtsa_agent.core.settings.config import agreed_settings
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 from dtsa_agent.keys import check_key
 from dtsa_agent.priority import PrioritySettings, set_realtime
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings, swarm_wide_node
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import ending, run_node
-from dtsa_agent.ros.common.process.runs import Run
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.node_process import ending, run_node
+from dtsa_agent.ros.common.parameters import check_parameters, declare_setting, declare_settings, swarm_wide_node
+from dtsa_agent.ros.common.runs import Run
+from dtsa_agent.stop import Stop
 from dtsa_bench.drawing import optional_picture
 from dtsa_bench.runs.config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.options import new_directory

@@ -14,10 +14,9 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import Scenario
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
-from dtsa_agent.ros.common.wire.messages import Fields
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import REPRESENTATION, SECOND, pack_received
+from dtsa_agent.ros.common.messages import Fields
 from dtsa_bench.log.arrays import PRESENT, UNRECORDED
 from dtsa_bench.log.bag.cdr import CdrBuilder, OdometryPacker
 from dtsa_bench.log.bag.metadata import RUN_ID

@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.station import check_joinable
-from dtsa_agent.ros.common.graph.names import named
+from dtsa_agent.ros.common.names import agent_names
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 from dtsa_channel_sim.ros.roster import LOST_AFTER_S
@@ -80,7 +80,7 @@ class RealtimeSupervisor(ChannelObserver):
         while self._late and begin_s and time.monotonic() - begin_s >= self._late[0].after_s:
             start = self._late.pop(0)
             start.start()
-            self._say(f"{named([start.agent])} is started")
+            self._say(f"{agent_names([start.agent])} is started")
 
     def _miss(self, child: Child) -> None:
         """Takes note that a process has ended.
@@ -141,9 +141,9 @@ class RealtimeSupervisor(ChannelObserver):
     def agents_back(self, agents: list[int]) -> None:
         again = "" if self._new.issuperset(agents) else " again"
         self._new.difference_update(agents)
-        self._say(f"{named(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
+        self._say(f"{agent_names(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
 
     def agent_silent(self, agent: int) -> None:
         known = {agent for child in self._children.all if child.process.poll() is not None for agent in child.agents}
         if agent not in known | {start.agent for start in self._late}:
-            self._say(f"{named([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")
+            self._say(f"{agent_names([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")

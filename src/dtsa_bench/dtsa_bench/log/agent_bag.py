@@ -33,8 +33,8 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import TAG_LENGTH
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench import __version__
 from dtsa_bench.log.arrays import NEW
 from dtsa_bench.log.record import (

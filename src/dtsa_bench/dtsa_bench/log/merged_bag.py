@@ -21,8 +21,8 @@ from dtsa_agent.air.port import NETWORK, frame_in
 from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench.log.arrays import NEW, UNKNOWN
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.knowledge import Ages, Knowledge, ObservedPairs

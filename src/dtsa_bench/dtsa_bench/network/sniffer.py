@@ -16,7 +16,7 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.station import OTHER_TIME, REPEATED, StationSettings
 from dtsa_agent.keys import authenticator
-from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common import names
 from dtsa_agent.stop import Stop
 from dtsa_bench.log.agent_bag import RecordFile
 from dtsa_bench.log.record import SNIFFER, frame_fields, pack_record

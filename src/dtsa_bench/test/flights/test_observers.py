@@ -23,9 +23,9 @@ from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
 from dtsa_agent.core.frame import encode_frame
 from dtsa_agent.core.settings.config import settings_hash
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.loop import Feed
-from dtsa_agent.ros.common.wire.messages import header_of
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.messages import header_of
 from dtsa_bench.flights import measurement
 from dtsa_bench.flights.measurement import PositionLog
 from dtsa_bench.flights.recorded_channel import RecordedFlight

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.wire.checks import FARTHEST_M, RANGE, SIZES, SLOT, Unusable, check_frames, check_ids
-from dtsa_agent.ros.common.wire.messages import TRANSMISSION, Fields
-from dtsa_agent.ros.common.wire.packing import split_frames
+from dtsa_agent.ros.common.cdr import split_frames
+from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, SLOT, BadMessage, check_frames, check_ids
+from dtsa_agent.ros.common.messages import TRANSMISSION, Fields
+from dtsa_agent.ros.common.names import agent_names
 
 Array = NDArray[np.float64]
 Places = slice | NDArray[np.intp]
@@ -86,7 +86,7 @@ class Answers:
     def add(self, message: Fields) -> bool:
         """Add one transmission message; return False if its agents have answered already: nothing is changed then.
 
-        :raises Unusable: if its fields do not fit together, naming the agents as far as it does.
+        :raises BadMessage: if its fields do not fit together, naming the agents as far as it does.
         """
         at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
         if self.answered[at].any():
@@ -147,7 +147,7 @@ class Answers:
 def places_of(ids: Any, agents: int, known: dict[bytes, Places]) -> Places:
     """Return the indices of a message's agents, a slice where they are consecutive; ``known`` keeps them.
 
-    :raises Unusable: for ids that do not ascend from 1 to N.
+    :raises BadMessage: for ids that do not ascend from 1 to N.
     """
     key = ids.tobytes()
     places = known.get(key)
@@ -185,8 +185,8 @@ _ITEM_BYTES = {
 }
 
 
-def _unusable(reason: str, message: Fields, detail: str, what: str = "an unusable answer") -> Unusable:
-    return Unusable(reason, f"{named(message.agent)} sent {what}: {detail}")
+def _unusable(reason: str, message: Fields, detail: str, what: str = "an unusable answer") -> BadMessage:
+    return BadMessage(reason, f"{agent_names(message.agent)} sent {what}: {detail}")
 
 
 class Delivered(NamedTuple):
@@ -236,14 +236,14 @@ class Accounts:
     def add(self, message: Fields, latest: int) -> int:
         """Add a report; return its last slot that is still open, -1: none. No slot after ``latest`` can have begun.
 
-        :raises Unusable: if its fields do not fit together.
+        :raises BadMessage: if its fields do not fit together.
         """
         at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
         _check_report(message, self._steps)
         slots = message.slot.tolist()
         last = max(slots[-1] if slots else 0, max(message.heard_in.tolist(), default=0))
         if last > latest:
-            raise Unusable(SLOT, f"{named(message.agent)} reported slot {last}, which has not begun")
+            raise BadMessage(SLOT, f"{agent_names(message.agent)} reported slot {last}, which has not begun")
         motion = [getattr(message, name).reshape(len(slots), -1) for name in _MOTION] if slots else []
         newest = -1
         for row, slot in enumerate(slots):

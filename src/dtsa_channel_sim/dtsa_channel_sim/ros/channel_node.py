@@ -19,10 +19,10 @@ from rclpy.parameter import Parameter
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import setting, settings_of
 from dtsa_agent.priority import PrioritySettings, set_realtime
-from dtsa_agent.ros.common.graph.names import MODES
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, from_parameter, swarm_wide_node
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import ending, run_node
+from dtsa_agent.ros.common.names import MODES
+from dtsa_agent.ros.common.node_process import ending, run_node
+from dtsa_agent.ros.common.parameters import check_parameters, declare_settings, from_parameter, swarm_wide_node
+from dtsa_agent.stop import Stop
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, AnswerLimits, ChannelConfig
 from dtsa_channel_sim.model.schedule import Change

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common.wire.messages import Fields
+from dtsa_agent.ros.common.messages import Fields
 from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import Verdict
 

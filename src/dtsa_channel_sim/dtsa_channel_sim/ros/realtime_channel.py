@@ -15,10 +15,10 @@ from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.agents.delays import Delays
 from dtsa_agent.core.frame import named_in
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.loop import Feed
-from dtsa_agent.ros.common.wire.checks import RANGE, SIZES, Unusable, check_start
-from dtsa_agent.ros.common.wire.messages import Fields, header_of, ns_of, read_report
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.messages import Fields, header_of, ns_of, read_report
 from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
@@ -350,7 +350,7 @@ class RealtimeChannel(RosChannel):
     def _accept_frame(self, data: bytes) -> None:
         """Put a frame on the time line.
 
-        :raises Unusable: if it cannot be one.
+        :raises BadMessage: if it cannot be one.
         """
         message = self._decoded(data, Frame, _read_frame)
         slot, agent, length = message.slot, message.agent, len(message.data)
@@ -359,9 +359,9 @@ class RealtimeChannel(RosChannel):
         self.roster.check_frame(agent, time.monotonic(), self.loop.sender)
         start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
         if not 1 <= length <= self._longest:
-            raise Unusable(SIZES, f"a frame of {length} bytes")
+            raise BadMessage(SIZES, f"a frame of {length} bytes")
         if named_in(bytes(message.data)) != (agent, slot & 0xFFFFFFFF):
-            raise Unusable(RANGE, f"a frame for cf{agent} and slot {slot} that does not name them")
+            raise BadMessage(RANGE, f"a frame for cf{agent} and slot {slot} that does not name them")
         check_start(start_ns, now, early_ns=_AHEAD * self.slot_ns)
         check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
         key = (slot, agent)
@@ -409,7 +409,7 @@ class RealtimeChannel(RosChannel):
     def _accept_report(self, message: Fields) -> None:
         """Add one process's report to the accounts.
 
-        :raises Unusable: if it cannot be one.
+        :raises BadMessage: if it cannot be one.
         """
         if self.lost and not self.lost.isdisjoint(message.agent[: self.agents]):
             self._meet_processes()

@@ -15,15 +15,13 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.process.loop import Feed, Loop
-from dtsa_agent.ros.common.process.runs import Run, run_text
-from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire import checks
-from dtsa_agent.ros.common.wire.checks import Intake, Unusable
-from dtsa_agent.ros.common.wire.messages import SLOT, time_of
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import checks, names
+from dtsa_agent.ros.common.cdr import pack_received
+from dtsa_agent.ros.common.checks import BadMessage, Intake
+from dtsa_agent.ros.common.loop import Feed, Loop
+from dtsa_agent.ros.common.messages import SLOT, time_of
+from dtsa_agent.ros.common.names import agent_names
+from dtsa_agent.ros.common.runs import Patience, Run, run_text
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
 
@@ -177,8 +175,10 @@ class RosChannel:
                 call()
             self.loop.wait(wait_ns)  # what comes before the run begins does not count
             self._housekeeping()
-            if patience.look() > self._startup_s:
-                raise LocalProtocolError(f"{named(awaited)} did not report within {self._startup_s:g} s: dead or hung?")
+            if patience.spent_s() > self._startup_s:
+                raise LocalProtocolError(
+                    f"{agent_names(awaited)} did not report within {self._startup_s:g} s: dead or hung?"
+                )
         return True
 
     @contextmanager
@@ -223,14 +223,14 @@ class RosChannel:
     def _decoded(self, data: bytes, kind: type, read: Callable[[bytes], Any]) -> Any:
         """Return a message of this run.
 
-        :raises Unusable: if it is none.
+        :raises BadMessage: if it is none.
         """
         try:
             message = read(data)
         except Exception:  # rclpy has no common base for what a message can do to it
-            raise Unusable(checks.UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
+            raise BadMessage(checks.UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
         if message.run != self.run_id:
-            raise Unusable(checks.OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
+            raise BadMessage(checks.OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
         return message
 
     def _pack_slot(

@@ -17,13 +17,12 @@ from rclpy.publisher import Publisher
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import settings_hash
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.process.loop import Feed
-from dtsa_agent.ros.common.process.runs import run_text
-from dtsa_agent.ros.common.wire import checks
-from dtsa_agent.ros.common.wire.checks import OnePublisher, Unusable
-from dtsa_agent.ros.common.wire.messages import Fields, read_report
+from dtsa_agent.ros.common import checks, names
+from dtsa_agent.ros.common.checks import BadMessage, PublisherGuard
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.messages import Fields, read_report
+from dtsa_agent.ros.common.names import agent_names
+from dtsa_agent.ros.common.runs import run_text
 
 from .answers import Accounts, Answers
 
@@ -50,10 +49,10 @@ class Member:
     heard_s: float  # monotonic, when it last told about itself
     sender: bytes | None  # participant of all its messages; None: not known
     dropped: dict[str, int] = field(default_factory=dict)
-    publisher: OnePublisher = field(init=False)
+    publisher: PublisherGuard = field(init=False)
 
     def __post_init__(self) -> None:
-        self.publisher = OnePublisher(self.sender)
+        self.publisher = PublisherGuard(self.sender)
 
 
 class Roster:
@@ -106,18 +105,18 @@ class Roster:
         """Process what a process says about itself.
 
         :raises ConfigError: if it cannot take part, naming setting, both values and node.
-        :raises Unusable: for a message that cannot be, or of another run.
+        :raises BadMessage: for a message that cannot be, or of another run.
         """
         checks.check_process(message, self._agents)
         message.node = checks.plain(message.node)
         if message.run != self._run:
             self._hear_other(message, now_s)
-            raise Unusable(checks.OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
+            raise BadMessage(checks.OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
         member = self._members.get(message.process) or self._meet(message, now_s, sender)
         if member.sender != sender:
-            raise Unusable(checks.OTHER_SENDER, f"a message about {message.node} that is not its own")
+            raise BadMessage(checks.OTHER_SENDER, f"a message about {message.node} that is not its own")
         if member.ids != tuple(message.agent):
-            raise Unusable(checks.UNKNOWN, f"{message.node} for other agents than before")
+            raise BadMessage(checks.UNKNOWN, f"{message.node} for other agents than before")
         member.heard_s = now_s
         member.dropped = dict(zip(message.dropped_reason, message.dropped, strict=True))
         for rival, since_s in () if self.closed else self._rivals.values():
@@ -134,7 +133,7 @@ class Roster:
         self._compare(message)
         if any(agent in self._of for agent in member.ids):
             if len(self._rivals) >= _MOST_STRANGERS:
-                raise Unusable(checks.UNKNOWN, "too many processes for the same agents")
+                raise BadMessage(checks.UNKNOWN, "too many processes for the same agents")
             self._rivals[member.process] = (member, now_s)
         else:
             self._replace(member)
@@ -156,21 +155,21 @@ class Roster:
     def _conflict(self, rival: Member, taken: Set[int]) -> ConfigError:
         nodes = ", ".join(sorted({self._of[agent].node for agent in taken}))
         return ConfigError(
-            f"ids of {rival.node}", list(rival.ids), f"agents of no other process; {nodes} has {named(taken)}"
+            f"ids of {rival.node}", list(rival.ids), f"agents of no other process; {nodes} has {agent_names(taken)}"
         )
 
     def _compare(self, message: Process) -> None:
         """Compare a process's settings with those that all share.
 
         :raises ConfigError: if they differ.
-        :raises Unusable: if they are none.
+        :raises BadMessage: if they are none.
         """
         try:
             given = checks.parse_json(message.settings)
         except ValueError:
             given = None
         if not isinstance(given, dict) or settings_hash(given) != message.settings_hash:
-            raise Unusable(checks.RANGE, f"{message.node} says nothing about its settings")
+            raise BadMessage(checks.RANGE, f"{message.node} says nothing about its settings")
         for name in sorted(self._agreed):
             if name not in given or given[name] != self._agreed[name]:
                 allowed = f"{self._agreed[name]!r}, as {self._agreed_by[name]} has it"
@@ -189,24 +188,24 @@ class Roster:
             return
         since_s = self._left_over.setdefault(message.process, now_s)
         if now_s - since_s > _LEFT_OVER_S:
-            allowed = f"no process of another run on these topics; it has {named(message.agent)}"
+            allowed = f"no process of another run on these topics; it has {agent_names(message.agent)}"
             raise ConfigError(f"run of {message.node}", run_text(message.run), allowed)
 
     def check_sender(self, ids: Any, now_s: float, sender: bytes | None) -> None:
         """Check that a message can be from the process that has some agents."""
         member = self._groups.get(ids.tobytes())
         if member is None:
-            raise Unusable(checks.UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
+            raise BadMessage(checks.UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
         if not member.publisher.admits(now_s, sender):
-            raise Unusable(checks.OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}")
+            raise BadMessage(checks.OTHER_SENDER, f"a message for {agent_names(ids)} that is not of {member.node}")
 
     def check_frame(self, agent: int, now_s: float, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
         member = self._of.get(agent)
         if member is None:
-            raise Unusable(checks.UNKNOWN, f"a frame of cf{agent}, which no process has")
+            raise BadMessage(checks.UNKNOWN, f"a frame of cf{agent}, which no process has")
         if not member.publisher.admits(now_s, sender):
-            raise Unusable(checks.OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
+            raise BadMessage(checks.OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
 
     def dropped(self) -> dict[str, int]:
         """Return the number of messages that all processes have dropped, by reason."""
@@ -293,7 +292,7 @@ class RollCall:
         """Return the agents that have answered the first call since this was asked."""
         present: set[int] = set()
         for message in self._answers():
-            with suppress(Unusable):
+            with suppress(BadMessage):
                 self._accounts.add(message, self._number)
                 present.update(message.agent)
         return present

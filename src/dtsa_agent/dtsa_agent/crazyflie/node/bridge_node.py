@@ -30,10 +30,9 @@ from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.settings import load_swarm
 from dtsa_agent.crazyflie.state import State
 from dtsa_agent.priority import set_realtime, use_last_processor
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings
-from dtsa_agent.ros.common.process.loop import Serving
-from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
-from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_agent.ros.common.loop import ExecutorThread
+from dtsa_agent.ros.common.node_process import follow_supervisor, init_ros, limit_to_machine
+from dtsa_agent.ros.common.parameters import check_parameters, declare_settings
 
 from .interfaces import NODE
 from .preflight import FAIL, preflight
@@ -173,7 +172,7 @@ def run_node(node: BridgeNode) -> int:
         node.say("error", problem)
         node.bridge.close()
         return 1
-    serving = Serving(node.context, "executor", node)
+    serving = ExecutorThread(node.context, "executor", node)
     serving.start()
     node.say("info", "ready; Ctrl-C lands all, a second one stops all motors")
     interrupts.wait()

@@ -21,11 +21,10 @@ from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.keys import check_key
 from dtsa_agent.priority import avoid_last_processor, set_ordinary_thread, set_realtime
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import to_parameters
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.stop import StopToken
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.node_process import init_ros
+from dtsa_agent.ros.common.parameters import to_parameters
+from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.flights.children import Children, NodeError, describe_end
 from dtsa_bench.flights.domain import LAST_DOMAIN, ros_domain
 from dtsa_bench.flights.flight import END_S, QUIET, Flight, run_environment

@@ -28,7 +28,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS
 from dtsa_agent.priority import set_nice
-from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
+from dtsa_agent.ros.common.node_process import follow_supervisor, init_ros
 from dtsa_bench.log.bag.writer import BagWriter
 
 MISSION_BAG = "mission_bag"  # the whole mission's bag, beside that of the exchange

@@ -140,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
         request_fault(args)
         return 0
     if "DTSA_SUPERVISOR" in os.environ:  # the bridge started this fleet for itself, and has rclpy
-        from dtsa_agent.ros.common.process.node_process import follow_supervisor
+        from dtsa_agent.ros.common.node_process import follow_supervisor
 
         follow_supervisor()
     priority = whole_number(args.priority, "priority", 0, 90)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.agents.delays import Delays
-from dtsa_agent.ros.common.graph.names import named
+from dtsa_agent.ros.common.names import agent_names
 from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
 
 from dtsa_bench.log.arrays import FlightArrays, HeardFrames
@@ -256,4 +256,4 @@ class FramesOnAir:
 
 
 def _ids(mask: Mask) -> str:
-    return named((np.flatnonzero(mask) + 1).tolist())
+    return agent_names((np.flatnonzero(mask) + 1).tolist())

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, SwarmConfig
-from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.stop import Stop
 from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.flight import Flight, fly
 from dtsa_bench.flights.options import FlightOptions

@@ -1,4 +1,4 @@
-"""Messages as plain CDR, little endian, for what is written and read in every slot. Needs no ROS.
+"""Messages as plain CDR, little endian, and how frames and receiver bits lie in them. Needs no ROS.
 
 rclpy makes an object of every field of a message, one by one: 14 us a message, in place of 2 us. A struct packs and
 unpacks all fields of a message at once.
@@ -12,6 +12,9 @@ from functools import lru_cache
 from operator import itemgetter
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 REPRESENTATION = b"\x00\x01\x00\x00"  # stands before each body: plain CDR, little endian
 _FRAME = (4, b"map\0")  # frame_id of a header: length and text
 SECOND = 1_000_000_000  # ns
@@ -19,8 +22,14 @@ _HEADER = 16  # bytes of a header in that frame
 _COUNT = struct.Struct("<I")
 _MOST_KEPT = 512  # layouts of messages of a kind
 
+# Where the run's id lies in the messages that carry one, as CDR: after 4 bytes of representation and a header in frame
+# "map". It is random, and so outside all that is compared between flights.
+RUN_BYTES = slice(20, 24)
+_WITH_RUN = "Slot Transmission Frame Report Reception Decision Configuration RunStatus SlotRecord"
+RUN_MESSAGES = frozenset(f"dtsa_msgs/msg/{name}" for name in _WITH_RUN.split())
 
-class Message:
+
+class CdrMessage:
     """Messages of numbers and of sequences of numbers, behind a header in frame ``map``.
 
     Sequences are packed and read as the bytes of their elements. Messages whose sequences have the same lengths share
@@ -115,3 +124,50 @@ class Message:
 def _gap(end: int, size: int) -> str:
     """Return what stands in a struct between the end of a field and one that is aligned to its size."""
     return "x" * (-end % size)
+
+
+# Covariances are row-major 6 x 6 over (x, y, z, rotation about x, y, z), in m^2 and rad^2, (m/s)^2 and (rad/s)^2. Zeros
+# would mean that a value is exact.
+PRECISION = 1e-6  # m^2 or (m/s)^2: a millimetre, a millimetre per second
+UNKNOWN = 1e6  # nothing is known about this value
+
+
+def diagonal(linear: float, angular: float) -> NDArray[np.float64]:
+    """Return a covariance without correlations, (36,), by the variances of the first and of the last three values."""
+    return np.diag([linear] * 3 + [angular] * 3).ravel()
+
+
+POSE_COVARIANCE = TWIST_COVARIANCE = diagonal(PRECISION, UNKNOWN)  # of simulated bodies: the attitude is not modelled
+
+
+def without_run(data: bytes | memoryview) -> bytes:
+    """Return a message of :data:`RUN_MESSAGES`, as CDR, with the run's id blanked."""
+    return b"".join((data[: RUN_BYTES.start], bytes(4), data[RUN_BYTES.stop :]))
+
+
+def pack_received(mask: NDArray[np.bool_]) -> bytes:
+    """Return the field ``received``, one bit an agent and frame, of a mask (F, N) by frame and agent."""
+    return np.packbits(mask, axis=1, bitorder="little").tobytes()
+
+
+def unpack_received(data: bytes | memoryview, frames: int, agents: int) -> NDArray[np.uint8]:
+    """Return the mask (F, N), 0 or 1, that :func:`pack_received` packed.
+
+    :raises ValueError: if the field's length does not fit.
+    """
+    rows = np.frombuffer(data, dtype=np.uint8).reshape(frames, (agents + 7) // 8)
+    return np.unpackbits(rows, axis=1, count=agents, bitorder="little")
+
+
+def split_frames(data: bytes | memoryview, lengths: Sequence[int]) -> list[bytes]:
+    """Return the frames that lie one after the other in ``data``, by their lengths in bytes; 0 gives an empty one.
+
+    :raises ValueError: if the lengths do not add up to the data.
+    """
+    frames, at, whole = [], 0, bytes(data)
+    for length in lengths:
+        frames.append(whole[at : at + length])
+        at += length
+    if at != len(whole):
+        raise ValueError(f"{len(whole)} bytes of frames, {at} in their lengths")
+    return frames

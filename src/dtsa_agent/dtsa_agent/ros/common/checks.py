@@ -1,6 +1,6 @@
 """Checks of what comes in over the graph: one function a message type; what is not received is counted by reason.
 
-A check raises :class:`Unusable` with one of the reasons below; nothing else about the message may be believed then.
+A check raises :class:`BadMessage` with one of the reasons below; nothing else about the message may be believed then.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from nav_msgs.msg import Odometry
 
 from dtsa_agent.core.errors import RemoteProtocolError
 from dtsa_agent.core.swarm import FRAME_MAX
-from dtsa_agent.ros.common.graph import names
+
+from . import names
 
 UNREADABLE = "unreadable"  # not a message of its topic's type
 OTHER_RUN = "other run"
@@ -39,7 +40,7 @@ _MOST_REASONS = 64
 _LOG_S = 5.0  # from one line in the log to the next
 
 
-class Unusable(RemoteProtocolError):
+class BadMessage(RemoteProtocolError):
     """A message that is not received, for one of :data:`REASONS`; the text says what is wrong with it."""
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -70,10 +71,10 @@ class Intake:
 
     @contextmanager
     def guard(self) -> Iterator[None]:
-        """Drop and count what is :class:`Unusable` within."""
+        """Drop and count what is :class:`BadMessage` within."""
         try:
             yield
-        except Unusable as error:
+        except BadMessage as error:
             self.drop(error.reason, str(error))
 
 
@@ -83,7 +84,7 @@ def add_counts(total: dict[str, int], more: Mapping[str, int]) -> None:
         total[reason] = total.get(reason, 0) + count
 
 
-class OnePublisher:
+class PublisherGuard:
     """Admits the messages of one publisher: of a given sender, or of the first one until it has been silent.
 
     Where a middleware does not name senders this is off.
@@ -110,50 +111,50 @@ def check_slot(message: Any, agents: int) -> None:
     phase, senders, lengths, received = message.phase, message.sender, message.length, message.received
     count = len(senders)
     if phase > Slot.REFUSE:
-        raise Unusable(RANGE, f"slot message of phase {phase}")
+        raise BadMessage(RANGE, f"slot message of phase {phase}")
     if (message.slot > LARGEST_SLOT and phase != Slot.PREPARE) or message.heard_slot > LARGEST_SLOT:
-        raise Unusable(SLOT, f"slot message for slot {message.slot}")
+        raise BadMessage(SLOT, f"slot message for slot {message.slot}")
     if phase != Slot.RUN:
         if count or len(lengths) or len(received):
-            raise Unusable(SIZES, f"slot message of phase {phase} with frames")
+            raise BadMessage(SIZES, f"slot message of phase {phase} with frames")
         return
     if count == 0:
         if len(lengths) or len(message.data) or len(received):
-            raise Unusable(SIZES, "slot message with frames of nobody")
+            raise BadMessage(SIZES, "slot message with frames of nobody")
         return
     if len(lengths) != count or len(received) != count * ((agents + 7) // 8):
         detail = f"{count} senders, {len(lengths)} lengths, {len(received)} bytes of receivers"
-        raise Unusable(SIZES, f"slot message: {detail}")
+        raise BadMessage(SIZES, f"slot message: {detail}")
     check_frames(lengths, message.data)
     if not all(lengths):
-        raise Unusable(SIZES, "slot message with an empty frame")
+        raise BadMessage(SIZES, "slot message with an empty frame")
     check_ids(senders, agents, ascending=False)
 
 
 def check_frames(lengths: Sequence[int], data: Any) -> None:
     """Check that frames are as long as the air carries, and as the bytes that are there."""
     if sum(lengths) != len(data):
-        raise Unusable(SIZES, f"{len(data)} bytes of frames, {sum(lengths)} in their lengths")
+        raise BadMessage(SIZES, f"{len(data)} bytes of frames, {sum(lengths)} in their lengths")
     if len(lengths) and max(lengths) > FRAME_MAX:
-        raise Unusable(SIZES, f"a frame of {max(lengths)} bytes; the air carries {FRAME_MAX}")
+        raise BadMessage(SIZES, f"a frame of {max(lengths)} bytes; the air carries {FRAME_MAX}")
 
 
 def check_ids(ids: Sequence[int], agents: int, ascending: bool = True) -> None:
     """Check that ids are those of different agents of N, one at least, and in order if they have to be."""
     count = len(ids)
     if not count or count > agents or min(ids) < 1 or max(ids) > agents:
-        raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}; allowed: 1 to {agents}")
+        raise BadMessage(UNKNOWN, f"a message for agents {list(ids[:8])}; allowed: 1 to {agents}")
     if count > 1 and (len(set(ids)) != count or (ascending and any(a >= b for a, b in itertools.pairwise(ids)))):
-        raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}, twice or out of order")
+        raise BadMessage(UNKNOWN, f"a message for agents {list(ids[:8])}, twice or out of order")
 
 
 def check_numbers(name: str, values: Iterable[float], largest: float = FARTHEST_M) -> None:
     """Check that numbers are finite and not beyond a magnitude."""
     for value in values:
         if not math.isfinite(value):
-            raise Unusable(RANGE, f"{name} that are no numbers")
+            raise BadMessage(RANGE, f"{name} that are no numbers")
         if abs(value) > largest:
-            raise Unusable(RANGE, f"{name} beyond {largest:g}")
+            raise BadMessage(RANGE, f"{name} beyond {largest:g}")
 
 
 def check_start(start_ns: int, now_ns: int, early_ns: int = 10_000_000_000, late_ns: int = 60_000_000_000) -> None:
@@ -162,16 +163,16 @@ def check_start(start_ns: int, now_ns: int, early_ns: int = 10_000_000_000, late
     Times are ns on the channel's time line.
     """
     if not now_ns - late_ns <= start_ns <= now_ns + early_ns:
-        raise Unusable(SLOT, f"a transmission that starts {(start_ns - now_ns) / 1e9:.3g} s from now")
+        raise BadMessage(SLOT, f"a transmission that starts {(start_ns - now_ns) / 1e9:.3g} s from now")
 
 
 def check_process(message: Process, agents: int) -> None:
     """Check what a process says about itself, in a swarm of N agents."""
     check_ids(message.agent, agents)
     if len(message.dropped_reason) != len(message.dropped) or len(message.dropped) > _MOST_REASONS:
-        raise Unusable(SIZES, f"{len(message.dropped)} counts for {len(message.dropped_reason)} reasons")
+        raise BadMessage(SIZES, f"{len(message.dropped)} counts for {len(message.dropped_reason)} reasons")
     if len(message.settings) > _LONGEST_TEXT or any(len(reason) > 64 for reason in message.dropped_reason):
-        raise Unusable(SIZES, f"{len(message.settings)} characters of settings")
+        raise BadMessage(SIZES, f"{len(message.settings)} characters of settings")
 
 
 def check_odometry(message: Odometry) -> None:
@@ -181,7 +182,7 @@ def check_odometry(message: Odometry) -> None:
     check_numbers("velocities", (speed.x, speed.y, speed.z), FASTEST_ODOMETRY_MPS)
     check_numbers("attitudes", (q.x, q.y, q.z, q.w))
     if not 0.9 < math.hypot(q.x, q.y, q.z, q.w) < 1.1:
-        raise Unusable(RANGE, "attitudes that are no unit quaternions")
+        raise BadMessage(RANGE, "attitudes that are no unit quaternions")
 
 
 def parse_json(data: bytes | str) -> Any:

@@ -1,19 +1,23 @@
-"""A run's random id, how its channel calls the agents, the proof that only this channel can end it, and its process."""
+"""A run: its random id, how its channel calls the agents, the proof that only it can end the run; and patience."""
 
 from __future__ import annotations
 
 import json
 import os
+import time
 from dataclasses import asdict, dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
-from dtsa_agent.ros.common.wire.checks import parse_json
+from .checks import parse_json
 
 _PROOF_BYTES = 16
 _LONGEST = 4096  # bytes
 _MOST_SESSIONS = 2**63
+_FIRST_LINE_S, _LONGEST_LINE_S = 2.0, 60.0  # from one line to the next
+_LONGEST_CHECK_S = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,22 +32,23 @@ class ProcessName:
     @classmethod
     def own(cls, node: str) -> ProcessName:
         """Return the name of this process, by its node's name with the namespace."""
-        return cls(node, _machine(), os.getpid(), _started(os.getpid()))
+        return cls(node, _machine(), os.getpid(), _state(os.getpid())[1])
 
     @property
-    def gone(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether the process has ended for sure. A stopped one has not; of other machines nothing is known."""
-        return self._of_here and _started(self.pid) != self.started
+        state, started = self._state()
+        return bool(state) and (started != self.started or state in "ZX")
 
     @property
-    def paused(self) -> bool:
+    def is_paused(self) -> bool:
         """Whether the process is there but stopped, by a signal or a debugger; of other machines nothing is known."""
-        fields = _fields(self.pid) if self._of_here else []
-        return bool(fields) and fields[0] in (b"T", b"t") and int(fields[19]) == self.started
+        state, started = self._state()
+        return state in ("T", "t") and started == self.started
 
-    @property
-    def _of_here(self) -> bool:
-        return bool(self.started) and self.machine == _machine() and self.pid > 0
+    def _state(self) -> tuple[str, int]:
+        here = self.started and self.machine == _machine() and self.pid > 0
+        return _state(self.pid) if here else ("", 0)
 
 
 @cache
@@ -55,26 +60,21 @@ def _machine() -> str:
         return ""
 
 
-def _started(pid: int) -> int:
-    """Return when a process started, in clock ticks after the boot; 0: there is none, or it is a zombie."""
-    fields = _fields(pid)
-    return int(fields[19]) if fields and fields[0] not in (b"Z", b"X") else 0
-
-
-def _fields(pid: int) -> list[bytes]:
-    """Return what the kernel says about a process, from its state on; nothing if there is none."""
+def _state(pid: int) -> tuple[str, int]:
+    """Return the state of a process (X: there is none, Z: a zombie), and when it started, clock ticks after boot."""
     try:
-        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+        fields = Path(f"/proc/{pid}/stat").read_text("ascii", "replace").rpartition(")")[2].split()
     except OSError:
-        return []
+        return "X", 0
+    return fields[0], int(fields[19])
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
     """What the channel knows about its run.
 
-    The hash of a secret is in the call. The secret is shown with the message that ends the run, so nobody else can send
-    that one before.
+    The hash of a secret is in the call. The secret is shown with the message that ends the run, so no other process can
+    send that one before.
     """
 
     number: int  # the id that all messages carry, 1 to 2^32 - 1; 64 bits would be more than some viewers can show
@@ -138,3 +138,41 @@ class Call:
 def run_text(number: int) -> str:
     """Return a run's id as logs and bags show it."""
     return f"{number:08x}"
+
+
+class Patience:
+    """For how long this process has looked for something in vain.
+
+    Time in which it did not run (Ctrl-Z, a debugger, a frozen container) does not count: what the others have sent
+    meanwhile has not reached it yet.
+    """
+
+    def __init__(self) -> None:
+        self._checked_s, self._spent_s = time.monotonic(), 0.0
+
+    def spent_s(self) -> float:
+        """Return the wall time spent so far, s; called several times a second."""
+        now = time.monotonic()
+        self._spent_s += min(now - self._checked_s, _LONGEST_CHECK_S)
+        self._checked_s = now
+        return self._spent_s
+
+
+class WaitingLog:
+    """Logs what is waited for, at once and then with a growing period; from the start when it is something else."""
+
+    def __init__(self, logger: Any) -> None:
+        self._logger = logger
+        self._text = ""
+        self._since_s = self._next_s = self._period_s = 0.0  # time.monotonic()
+
+    def log(self, text: str) -> None:
+        """Log it if it is time to."""
+        now = time.monotonic()
+        if text != self._text:
+            self._text, self._since_s, self._next_s, self._period_s = text, now, now + _FIRST_LINE_S, _FIRST_LINE_S
+            self._logger.info(text)
+        elif now >= self._next_s:
+            self._period_s = min(2 * self._period_s, _LONGEST_LINE_S)
+            self._next_s = now + self._period_s
+            self._logger.warning(f"{text}, for {now - self._since_s:.0f} s now")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import groupby
 from typing import Any
 
 SWARM = "/swarm"  # namespace of what the whole swarm shares
@@ -25,8 +26,7 @@ ODOMETRY = "odom"
 # In real time nobody waits for a process that gets no time: some seconds of messages wait for it instead.
 REALTIME_WAITING = 64
 
-# Calls before slot 0 are numbered from here on, as no slot is: an answer that comes late is not taken for what was done
-# in a slot.
+# Calls before slot 0 are numbered from here on, as no slot is: a late answer to one is no answer to a slot.
 FIRST_CALL = 1 << 31
 
 # A player's /clock and the stamps of a bag must not start at 0, which ROS takes for "no time yet".
@@ -66,22 +66,14 @@ def latched_qos() -> Any:
 
 
 def lockstep_qos(writers: int = 1) -> Any:
-    """Nothing may be lost on the way; every node has one message under way at a time, or a repeated one.
-
-    A reader's history is shared by all nodes that write to the topic.
-    """
+    """Nothing may be lost on the way; a reader's history is shared by all nodes that write to the topic."""
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
     return QoSProfile(depth=4 * writers, reliability=ReliabilityPolicy.RELIABLE)  # keeps the last, volatile
 
 
-def named(ids: Iterable[int]) -> str:
+def agent_names(ids: Iterable[int]) -> str:
     """Return agents as the user knows them: ``cf3``, or ``cf1 .. cf6`` for many in a row."""
-    listed = sorted(ids)
-    parts, start = [], 0
-    for end in range(1, len(listed) + 1):
-        if end == len(listed) or listed[end] != listed[end - 1] + 1:
-            first, last = listed[start], listed[end - 1]
-            parts.append(f"cf{first}" if first == last else f"cf{first} .. cf{last}")
-            start = end
-    return ", ".join(parts) or "nobody"
+    rows = [list(group) for _, group in groupby(enumerate(sorted(ids)), lambda item: item[1] - item[0])]
+    ends = [(row[0][1], row[-1][1]) for row in rows]
+    return ", ".join(f"cf{a}" if a == b else f"cf{a} .. cf{b}" for a, b in ends) or "nobody"

@@ -10,9 +10,7 @@ from process_helpers import addresses, segments_of
 from rclpy.node import Node
 
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
-from dtsa_agent.ros.common.process.node_process import ending
-from dtsa_agent.ros.common.workarounds import dds
-from dtsa_agent.ros.common.workarounds.dds import PROFILE, PROFILES, RANGE, TRANSPORTS, limit_to_machine
+from dtsa_agent.ros.common.node_process import PEERS, PROFILE, PROFILES, RANGE, TRANSPORTS, ending, limit_to_machine
 
 
 def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
@@ -29,7 +27,7 @@ def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
         before = dict(other)
         limit_to_machine(other)
         assert other == before
-    for wider in ({}, {RANGE: "SUBNET"}, {RANGE: "LOCALHOST", dds.PEERS: "10.0.0.2;10.0.0.3"}):
+    for wider in ({}, {RANGE: "SUBNET"}, {RANGE: "LOCALHOST", PEERS: "10.0.0.2;10.0.0.3"}):
         before = dict(wider)
         limit_to_machine(wider)
         assert wider == {**before, TRANSPORTS: "UDPv4"}

@@ -7,14 +7,17 @@ an ordinary executor a few times a second.
 
 from __future__ import annotations
 
+import ctypes
 import gc
+import os
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
+import rclpy
 from rclpy.callback_groups import CallbackGroup
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -24,9 +27,9 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.ros.common.wire.checks import UNREADABLE, Intake
-from dtsa_agent.ros.common.workarounds.taking import Taker
 from dtsa_agent.stop import Stop
+
+from .checks import UNREADABLE, Intake
 
 _POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
 HOUSEKEEPING_S = 0.1
@@ -35,7 +38,7 @@ _MOST_DROPPED = 16  # messages thrown away in a row before others get their turn
 _SERVING_S, _END_S = 0.5, 2.0
 
 
-class _OwnHands(CallbackGroup):
+class _NoExecutor(CallbackGroup):
     """Keeps ordinary executors away from a subscription."""
 
     def can_execute(self, entity: Any) -> bool:
@@ -46,6 +49,88 @@ class _OwnHands(CallbackGroup):
 
     def ending_execution(self, entity: Any) -> None:
         pass
+
+
+# Who sent a message: rclpy knows, but hands it out with no message. So one function of rcl is called through ctypes,
+# with the message information that it fills in. With another middleware or distribution there is no sender.
+# Upstream: rclpy, issue 1465 (`publisher_gid` in the information of a message; done in pull request 1466).
+# Delete when: the distribution that is used is one after Jazzy whose rclpy has it.
+_MIDDLEWARE = "rmw_fastrtps"  # ids of its publishers begin with that of their participant: one a process
+_DISTRIBUTION = "jazzy"  # whose structures these are
+_PARTICIPANT_BYTES = 12
+_TAKE_FAILED = 401  # RCL_RET_SUBSCRIPTION_TAKE_FAILED: there is no message
+_FIRST_BYTES = 4096  # the buffer grows with the messages
+
+
+class _Allocator(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")]
+
+
+class _Bytes(ctypes.Structure):
+    _fields_ = [("buffer", ctypes.c_void_p), *((n, ctypes.c_size_t) for n in ("length", "capacity")), ("_", _Allocator)]
+
+
+class _Information(ctypes.Structure):
+    _fields_ = [
+        *((n, ctypes.c_uint64) for n in ("sent", "received", "publication_number", "reception_number")),
+        ("implementation", ctypes.c_char_p), ("publisher", ctypes.c_uint8 * 16), ("intra_process", ctypes.c_bool),
+    ]  # fmt: skip
+
+
+@cache
+def _libraries() -> tuple[Any, Any] | None:
+    """Return rcl and rcutils of this process; None where the structures above are not theirs."""
+    known = rclpy.get_rmw_implementation_identifier().startswith(_MIDDLEWARE)
+    if not known or os.environ.get("ROS_DISTRO", _DISTRIBUTION) != _DISTRIBUTION:
+        return None
+    try:
+        rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
+        rcl.rcl_take_serialized_message.argtypes = [ctypes.c_void_p] * 4
+        rcutils.rcutils_get_default_allocator.restype = _Allocator
+        rcutils.rcutils_uint8_array_init.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p]
+        rcutils.rcutils_uint8_array_fini.argtypes = [ctypes.c_void_p]
+    except (OSError, AttributeError):
+        return None
+    return rcl, rcutils
+
+
+class Taker:
+    """Pops the messages of one subscription; its handle, rclpy's, has to be held open meanwhile."""
+
+    def __init__(self, handle: Any) -> None:
+        self.sender: bytes | None = None  # participant that sent the last message; None: not known
+        self._handle, self._libraries = handle, _libraries()
+        if self._libraries is not None:
+            rcl, rcutils = self._libraries
+            self._bytes, self._information = _Bytes(), _Information()
+            allocator = rcutils.rcutils_get_default_allocator()
+            rcutils.rcutils_uint8_array_init(ctypes.byref(self._bytes), _FIRST_BYTES, ctypes.byref(allocator))
+            self._take, self._reset = rcl.rcl_take_serialized_message, rcutils.rcutils_reset_error
+            self._arguments = handle.pointer, ctypes.addressof(self._bytes), ctypes.addressof(self._information), None
+            self._sender_at = ctypes.addressof(self._information) + _Information.publisher.offset
+
+    def take(self) -> bytes | None:
+        """Return a message that is there already, as CDR, or None.
+
+        :raises RuntimeError: if rcl cannot take it.
+        """
+        if self._libraries is None:
+            taken = self._handle.take_message(None, True)
+            return None if taken is None else bytes(taken[0])
+        code = self._take(*self._arguments)
+        if code:
+            if code == _TAKE_FAILED:
+                return None
+            self._reset()
+            raise RuntimeError(f"rcl error {code}")
+        self.sender = ctypes.string_at(self._sender_at, _PARTICIPANT_BYTES)
+        return ctypes.string_at(self._bytes.buffer, self._bytes.length)
+
+    def close(self) -> None:
+        """Free the buffer."""
+        if self._libraries is not None:
+            self._libraries[1].rcutils_uint8_array_fini(ctypes.byref(self._bytes))
+            self._take = lambda *arguments: _TAKE_FAILED
 
 
 class Feed:
@@ -69,7 +154,7 @@ class Feed:
         read: Callable[[bytes], Any] | None = None,
     ) -> None:
         self.subscription = node.create_subscription(
-            msg_type, topic, self._never, qos, callback_group=_OwnHands(), raw=True
+            msg_type, topic, self._refuse, qos, callback_group=_NoExecutor(), raw=True
         )
         self.handle = self.subscription.handle
         self._type, self._intake, self._admits = msg_type, intake, admits
@@ -84,7 +169,7 @@ class Feed:
         """Participant of DDS, which is a process, that sent the last message; None: not known."""
         return self._taker.sender
 
-    def _never(self, message: Any) -> None:
+    def _refuse(self, message: Any) -> None:
         raise LocalProtocolError("an executor took a message that is not its own")
 
     def take(self) -> Any:
@@ -131,32 +216,29 @@ class Loop(Feed):
         wait_set.wait(timeout_ns)
         return self.take()
 
-    def _something_waits(self) -> bool:
-        """Whether anything of the node but this subscription has to be served.
-
-        An executor takes milliseconds to find out that there is nothing to do.
-        """
+    def _needs_executor(self) -> bool:
+        """Whether anything of the node but this subscription has to be served: an executor takes milliseconds."""
         node = self._node
-        waiting = {
-            "subscription": [s for s in node.subscriptions if not isinstance(s.callback_group, _OwnHands)],
+        entities = {
+            "subscription": [s for s in node.subscriptions if not isinstance(s.callback_group, _NoExecutor)],
             "timer": list(node.timers),
             "client": list(node.clients),
             "service": list(node.services),
         }
-        if not any(waiting.values()):
+        subscriptions, timers, clients, services = map(len, entities.values())
+        if not subscriptions + timers + clients + services:
             return False
         if time.monotonic() > self._next_spin:
             self._next_spin = time.monotonic() + _SPIN_S
             return True
-        subscriptions, timers, clients, services = map(len, waiting.values())
         with ExitStack() as stack:
             wait_set = _rclpy.WaitSet(subscriptions, 0, timers, clients, services, 0, node.context.handle)
-            for kind, entities in waiting.items():
-                for entity in entities:
+            for kind, group in entities.items():
+                for entity in group:
                     stack.enter_context(entity.handle)
                     getattr(wait_set, f"add_{kind}")(entity.handle)
             wait_set.wait(0)
-            return any(wait_set.get_ready_entities(kind) for kind in waiting)
+            return any(wait_set.get_ready_entities(kind) for kind in entities)
 
     def housekeeping(self) -> bool:
         """Serve parameters and timers if it is time; return whether it was."""
@@ -164,7 +246,7 @@ class Loop(Feed):
         if now < self._next_housekeeping:
             return False
         self._next_housekeeping = now + HOUSEKEEPING_S
-        if self._something_waits():
+        if self._needs_executor():
             if self._executor is None:
                 self._executor = SingleThreadedExecutor(context=self._node.context)
                 self._executor.add_node(self._node)
@@ -190,7 +272,7 @@ class Loop(Feed):
         super().close()
 
 
-class Serving:
+class ExecutorThread:
     """Calls the callbacks of nodes in a thread of this name, from ``start`` to ``close``.
 
     ``Executor.spin`` in a thread raises when the executor is shut down under it; this ends between two callbacks.
@@ -201,7 +283,7 @@ class Serving:
         for node in nodes:
             self.executor.add_node(node)
         self._context, self._closed = context, threading.Event()
-        self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
@@ -215,7 +297,7 @@ class Serving:
             self._thread.join(_END_S)
         self.executor.shutdown(timeout_sec=0)
 
-    def _serve(self) -> None:
+    def _run(self) -> None:
         with suppress(ExternalShutdownException):
             while self._context.ok() and not self._closed.is_set():
                 self.executor.spin_once(timeout_sec=_SERVING_S)

@@ -21,21 +21,48 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.ros.common.workarounds._endless import mend
-from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 from dtsa_agent.stop import Stop, in_time
+
+from ._endless import mend
 
 _PR_SET_PDEATHSIG = 1
 SUPERVISOR = "DTSA_SUPERVISOR"  # process id of the supervisor that started this node, if one did
 _MIDDLEWARE = "libfastrtps"  # Fast DDS 2
 _LONGEST_END_S = 20.0  # of a node; the middleware was seen to stand still when others left in the same moment
 
+# Fast DDS on one machine: no socket beyond loopback, and no shared memory.
+# Upstream: rmw_fastrtps, pull request 653 (adds LOCALHOST, which listens on all interfaces); Fast DDS, issue 6535 (a
+# sender waits for an idle port in shared memory); Fast DDS, issues 2790, 5053 and 5469 (what killed processes leave
+# in shared memory, and that a process which is started again hears nothing).
+# Delete when: rmw_fastrtps binds LOCALHOST to loopback alone, and shared memory outlasts killed processes.
+RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+PEERS = "ROS_STATIC_PEERS"
+TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
+# Fast DDS 2 reads the first, Fast DDS 3 the second.
+PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+PROFILE = Path(__file__).with_name("loopback.xml")
+
+
+def limit_to_machine(environment: MutableMapping[str, str]) -> None:
+    """Make ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` mean the loopback interface alone; UDP in any case.
+
+    rmw_fastrtps adds a UDP transport of its own under LOCALHOST, which listens on all interfaces. With SYSTEM_DEFAULT
+    it uses the transports of our profile instead. Another range, peers elsewhere, another middleware, other transports
+    or a profile of the user stay. Call it before the process uses the middleware.
+    """
+    if not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp").startswith("rmw_fastrtps"):
+        return
+    ours = all(environment.get(name) == str(PROFILE) for name in PROFILES)  # of the process that started this one
+    if not ours and any(name in environment for name in PROFILES):
+        return
+    if not (ours or environment.get(RANGE) == "LOCALHOST") or environment.get(PEERS):
+        environment.setdefault(TRANSPORTS, "UDPv4")
+        return
+    environment.update({RANGE: "SYSTEM_DEFAULT", **dict.fromkeys(PROFILES, str(PROFILE))})
+
 
 def follow_supervisor() -> bool:
-    """Let the kernel end this process when its supervisor ends, however that ends; return whether there is one.
-
-    A supervisor answers for names and parameters, too.
-    """
+    """Let the kernel end this process when its supervisor ends, however that ends; return whether there is one."""
     parent = os.environ.get(SUPERVISOR)
     if not parent:
         return False
@@ -66,7 +93,7 @@ def init_ros(args: list[str] | None, context: Context | None = None, domain_id: 
 
 
 def log_where_possible(environment: MutableMapping[str, str]) -> None:
-    """Let ROS write its logs to a temporary directory if its own cannot be made or written to, and say so."""
+    """Let ROS write its logs to a temporary directory if its own cannot be made or written to, and print that."""
     home = environment.get("ROS_HOME") or os.path.join(os.path.expanduser("~"), ".ros")
     directory = Path(environment.get("ROS_LOG_DIR") or os.path.join(home, "log"))
     try:
@@ -93,7 +120,7 @@ def run_node(name: str, body: Callable[[Stop, bool], int | None], args: Sequence
 
     0: a clean end (by a signal, too); 2: settings that are not usable; 1: other errors.
 
-    :param name: what it calls itself in error messages.
+    :param name: its own, for error messages.
     :param body: creates the node and runs it; gets the signal flag and whether a supervisor started this process.
     :param args: command line, default ``sys.argv``.
     """

@@ -12,9 +12,8 @@ from dtsa_msgs.msg import Report, Slot, Transmission
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
-from dtsa_agent.ros.common.graph import names
-
-from .cdr import SECOND, Message
+from . import names
+from .cdr import SECOND, CdrMessage
 
 _CODES = {"uint8": "B", "uint16": "H", "uint32": "I", "int64": "q", "double": "d"}
 #: The fields of a message under their names there, and ``time_ns``, the stamp of the header. Sequences are the bytes of
@@ -22,7 +21,7 @@ _CODES = {"uint8": "B", "uint16": "H", "uint32": "I", "int64": "q", "double": "d
 Fields: TypeAlias = Any
 
 
-class MessageType(Message):
+class MessageType(CdrMessage):
     """A type of dtsa_msgs whose first sequence is one of ids."""
 
     def __init__(self, kind: Any) -> None:
@@ -43,15 +42,15 @@ class MessageType(Message):
         :raises Exception: of any kind, as rclpy does, for what is no message of the type.
         """
         values = self.read(data)
-        return self.fields_of(deserialize_message(data, self._kind)) if values is None else self._made(*values)
+        return self.fields_of(deserialize_message(data, self._kind)) if values is None else self._make_fields(*values)
 
     def fields_of(self, message: Any) -> Fields:
         """Return the fields of a message as rclpy has it."""
         values = (getattr(message, name) for name in self.fields)
         stamp = message.header.stamp
-        return self._made(stamp.sec, stamp.nanosec, *(v if isinstance(v, int) else v.tobytes() for v in values))
+        return self._make_fields(stamp.sec, stamp.nanosec, *(v if isinstance(v, int) else v.tobytes() for v in values))
 
-    def _made(self, seconds: int, ns: int, *values: Any) -> Fields:
+    def _make_fields(self, seconds: int, ns: int, *values: Any) -> Fields:
         fields, at = [seconds * SECOND + ns, *values], self._ids
         fields[at] = array("H", fields[at])
         return self._fields._make(fields)
