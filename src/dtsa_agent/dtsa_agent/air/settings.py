@@ -176,12 +176,9 @@ class SerialSettings(Settings):
     baud: int = setting(57_600, "speed of the line to the modem", unit="bit/s", minimum=1200, maximum=4_000_000)
     modem: str = setting(NONE, "the modem, from whose times arrivals are corrected", choices=tuple(MODEMS))
     modem_time_ns: int | None = setting(
-        None,
-        "what the modem takes for a packet without the time of its bytes; default: as of its kind",
-        unit="ns",
-        minimum=0,
-        maximum=10 * _SECOND,
-    )
+        None, "what the modem takes for a packet without the time of its bytes; default: as of its kind", unit="ns",
+        minimum=0, maximum=10 * _SECOND,
+    )  # fmt: skip
     air_byte_ns: int | None = setting(
         None, "what each byte takes on the air; default: as of its kind", unit="ns", minimum=0, maximum=_SECOND
     )

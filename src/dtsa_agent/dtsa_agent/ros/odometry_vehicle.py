@@ -63,10 +63,9 @@ class VehicleSettings(Settings):
     command_topic: str = setting("cmd_vel", "topic on which the vehicle takes velocities")
     command_frame: str = setting(MAP, "axes of these velocities: the map's, or the body's", choices=(MAP, BODY))
     command_type: str = setting(
-        TWIST,
-        "geometry_msgs/TwistStamped, or dtsa_msgs/VelocityWorld as the bridge takes",
+        TWIST, "geometry_msgs/TwistStamped, or dtsa_msgs/VelocityWorld as the bridge takes",
         choices=(TWIST, VELOCITY_WORLD),
-    )
+    )  # fmt: skip
     command_hz: float = setting(50.0, "rate of the commands, at most one a slot", unit="Hz", minimum=1, maximum=200)
     stale_s: float = setting(0.3, "odometry older than this holds the vehicle", unit="s", minimum=0.02, maximum=5)
     fastest_mps: float = setting(

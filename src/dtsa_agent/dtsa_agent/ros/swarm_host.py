@@ -44,10 +44,9 @@ class HostSettings(Settings):
 
     odometry: bool = setting(True, "offer each agent's true motion as <agent>/odom")
     mode: str = setting(
-        names.MODES[0],
-        "in lockstep all wait for each other; in real time each agent has a clock of its own",
+        names.MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own",
         choices=names.MODES,
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +58,9 @@ class RealtimeSettings(Settings):
     )
     align: bool = setting(True, "agents move their slots towards what they hear")
     nice: int = setting(
-        0,
-        "without real-time priority: by how much this process gives way to others, the channel above all: nice",
-        minimum=0,
-        maximum=19,
-    )
+        0, "without real-time priority: by how much this process gives way to others, the channel above all: nice",
+        minimum=0, maximum=19,
+    )  # fmt: skip
 
 
 def declare_swarm(node: Node) -> SwarmConfig:

@@ -21,16 +21,7 @@ from dtsa_msgs.msg import Process, Slot
 from nav_msgs.msg import Odometry
 
 from dtsa_agent.ros.common import checks
-from dtsa_agent.ros.common.checks import (
-    RANGE,
-    SIZES,
-    SLOT,
-    UNKNOWN,
-    BadMessage,
-    Intake,
-    PublisherGuard,
-    check_slot,
-)
+from dtsa_agent.ros.common.checks import RANGE, SIZES, SLOT, UNKNOWN, BadMessage, Intake, PublisherGuard, check_slot
 from dtsa_agent.ros.common.runs import Call, ProcessName, Run
 
 HEARD = {"sender": [2, 12], "length": [2, 1], "data": [1, 2, 3], "received": [1, 2, 3, 4]}

@@ -24,26 +24,20 @@ class FlightOptions(AnswerLimits):
     respawn: float | None = setting(
         None,
         "real time: a process that died is started again after so long, and its agents come back; default: never",
-        unit="s",
-        minimum=0,
-        maximum=3600,
-    )
+        unit="s", minimum=0, maximum=3600,
+    )  # fmt: skip
     late: Mapping[int, float] = setting(
         {}, "real time: agents that are started so long after slot 0, s by id", kind="structure", custom=True
     )
     wall_timeout_s: float | None = setting(
         None,
         "a flight that takes longer by the clock on the wall is ended; default: ten times timeout_s, at least 120",
-        unit="s",
-        minimum=1,
-        maximum=864000,
-    )
+        unit="s", minimum=1, maximum=864000,
+    )  # fmt: skip
     priority: int = setting(
-        10,
-        "real time: real-time priority of the agents, one more for the channel, where allowed; 0: none",
-        minimum=0,
-        maximum=90,
-    )
+        10, "real time: real-time priority of the agents, one more for the channel, where allowed; 0: none",
+        minimum=0, maximum=90,
+    )  # fmt: skip
     pictures: bool = setting(True, "draw trajectories.png")
 
     def wall_limit_s(self, timeout_s: float) -> float:

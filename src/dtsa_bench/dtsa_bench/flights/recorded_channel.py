@@ -88,7 +88,7 @@ class RecordedFlight:
     def summary(self) -> dict[str, Any]:
         """The flight's results."""
         channel = self.channel
-        result = {**self.measurement.summary(), "unusable_messages": channel.unusable}
+        result = {**self.measurement.summary(), "unusable_messages": channel.intake.total}
         result["not_taken_in"] = kept_out = dict(sorted(channel.dropped().items()))
         hearing = self.measurement.hearing
         hearing.settle(kept_out)

@@ -65,7 +65,7 @@ class RealtimeSupervisor(ChannelObserver):
             measurement.metrics.awaited.add(start.agent)
             channel.expect_later(start.agent, measurement.scenario.start[:, start.agent - 1])
 
-    def begun(self, at_s: float) -> None:
+    def start_known(self, at_s: float) -> None:
         if text := tight(self._channel):
             self._say(text)
 

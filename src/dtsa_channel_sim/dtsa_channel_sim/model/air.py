@@ -191,7 +191,7 @@ class Air(Generic[Key]):
         medium = self._channel.medium(self._slot(when_ns))
         return any(medium.senses(receiver, when_ns, frame, positions) for frame in self._near)
 
-    def settle(self, until_ns: int, positions: Positions | None = None) -> list[FrameVerdict[Key]]:
+    def resolve(self, until_ns: int, positions: Positions | None = None) -> list[FrameVerdict[Key]]:
         """Return the verdicts on all frames that have left the air by a time, in the order of their ends.
 
         Every frame that starts before it has been handed in. The result does not depend on the order in which frames

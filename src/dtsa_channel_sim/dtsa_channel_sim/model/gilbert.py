@@ -56,9 +56,7 @@ class GilbertElliott:
         shortest = 1.0 / (1.0 - share)
         if burst_length < shortest * (1.0 - 1e-12):
             raise ConfigError(
-                "burst_length",
-                burst_length,
-                f"at a loss of {loss:g} at least {shortest:.4g} slots, or 0 for none",
+                "burst_length", burst_length, f"at a loss of {loss:g} at least {shortest:.4g} slots, or 0 for none"
             )
         leave = 1.0 / burst_length
         return cls(share, leave * share / (1.0 - share), leave)

@@ -28,7 +28,7 @@ _FARTHEST_OFF_NS = 60_000_000_000  # no agent's slot is farther from the channel
 
 
 @dataclass(slots=True)
-class TakenIn:
+class FrameReceipt:
     """A frame that agents received during a slot, in real time."""
 
     slot: int  # as its sender counts
@@ -62,7 +62,7 @@ class Answers:
         self.command = self._motion[-6:-3]  # m/s, now
         self.goal = self._motion[-3:]  # m
         self.offset_ns = np.zeros(agents, dtype=np.int64)  # real time: of slot or transmission
-        self.taken_in: list[TakenIn] | None = None  # real time: what the agents report to have received in the slot
+        self.receipts: list[FrameReceipt] | None = None  # real time: what agents report to have received
         self._goal_known = np.zeros(agents, dtype=np.bool_)
         self._places: dict[bytes, Places] = {}
         self._lengths: dict[int, tuple[int, ...]] = {}  # of the fields of answers that fit, by number of agents
@@ -121,11 +121,8 @@ class Answers:
         self.missing -= count
         return True
 
-    def put(self, at: Places, count: int, offset_ns: Any, motion: Sequence[Array], **decided: Any) -> None:
-        """Add a report of real time, checked: start of slots or transmissions, motion, decision.
-
-        Motion is track (m), velocity, command (m/s) and goal (m), as in a report.
-        """
+    def add_report(self, at: Places, count: int, offset_ns: Any, motion: Sequence[Array], **decided: Any) -> None:
+        """Add a report of real time, checked: start of slots or transmissions; track, velocity, command, goal."""
         self._motion[:, at] = np.concatenate(motion).reshape(-1, count)
         for name, values in decided.items():
             getattr(self, name)[at] = values
@@ -189,7 +186,7 @@ def _unusable(reason: str, message: Fields, detail: str, what: str = "an unusabl
     return BadMessage(reason, f"{agent_names(message.agent)} sent {what}: {detail}")
 
 
-class Delivered(NamedTuple):
+class DeliveredFrame(NamedTuple):
     """A frame that was sent to its receivers."""
 
     data: bytes
@@ -208,8 +205,8 @@ class Accounts:
         self.missed = 0  # entries of reports that came too late to count
         self._open: dict[int, Answers] = {}
         self._closed = -1
-        self._delivered: dict[tuple[int, int], Delivered] = {}  # by slot and sender
-        self._taken_in: dict[int, dict[tuple[int, int], TakenIn]] = {}
+        self._delivered: dict[tuple[int, int], DeliveredFrame] = {}  # by slot and sender
+        self._receipts: dict[int, dict[tuple[int, int], FrameReceipt]] = {}  # by slot here; slot and sender
         self._places: dict[bytes, Places] = {}
 
     def __getitem__(self, slot: int) -> Answers:
@@ -229,7 +226,7 @@ class Accounts:
         reported = [slot for slot, book in self._open.items() if book.answered[agent - 1]]
         return self._open[max(reported)].position[:, agent - 1] if reported else None
 
-    def deliver(self, slot: int, sender: int, delivered: Delivered) -> None:
+    def deliver(self, slot: int, sender: int, delivered: DeliveredFrame) -> None:
         """A frame has been sent to its receivers."""
         self._delivered[slot, sender] = delivered
 
@@ -255,7 +252,7 @@ class Accounts:
                 continue  # reported twice
             part = slice(row * count, (row + 1) * count)
             decided = {name: getattr(message, name)[part] for name in _DECIDED}
-            book.put(at, count, message.offset_ns[part], [planes[row] for planes in motion], **decided)
+            book.add_report(at, count, message.offset_ns[part], [planes[row] for planes in motion], **decided)
             newest = slot
         if len(message.heard_sender):
             self._add_received(message, at, count)
@@ -270,24 +267,24 @@ class Accounts:
             delivered = self._delivered.get((slot, sender))
             if delivered is None:
                 continue
-            entries = self._taken_in.setdefault(max(here, self._closed + 1), {})
-            taken = entries.get((slot, sender))
-            if taken is None:
+            receipts = self._receipts.setdefault(max(here, self._closed + 1), {})
+            if (slot, sender) not in receipts:
                 never = np.full(self.agents, -1, dtype=np.int64)
-                taken = entries[slot, sender] = TakenIn(slot, sender, delivered.data, delivered.arrival_ns, never)
-            taken.at_ns[at] = np.where(mask & delivered.received[at], max(0, at_ns), taken.at_ns[at])
+                receipts[slot, sender] = FrameReceipt(slot, sender, delivered.data, delivered.arrival_ns, never)
+            times = receipts[slot, sender].at_ns
+            times[at] = np.where(mask & delivered.received[at], max(0, at_ns), times[at])
 
     def close(self, slot: int) -> None:
         """A slot is over: its account and what is too old is forgotten."""
         self._closed = slot
         self._open.pop(slot, None)
-        self._taken_in.pop(slot, None)
+        self._receipts.pop(slot, None)
         while self._delivered and (oldest := next(iter(self._delivered)))[0] < slot - self._keep:
             del self._delivered[oldest]
 
-    def taken_in(self, slot: int) -> list[TakenIn]:
+    def receipts(self, slot: int) -> list[FrameReceipt]:
         """Return the frames that agents received during a slot, as far as they have reported."""
-        return list(self._taken_in.get(slot, {}).values())
+        return list(self._receipts.get(slot, {}).values())
 
 
 def _check_report(message: Fields, steps: int) -> None:

@@ -70,9 +70,7 @@ class ChannelNodeSettings(AnswerLimits):
 
     slots: int = setting(0, "the run ends after so many slots; 0: by a signal only", minimum=0, maximum=2**31)
     mode: str = setting(
-        MODES[0],
-        "in lockstep all wait for each other; in real time each agent has a clock of its own",
-        choices=MODES,
+        MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own", choices=MODES
     )
     steps: int = setting(1, "control instants in a slot, as the agents have", minimum=1, maximum=255)
 

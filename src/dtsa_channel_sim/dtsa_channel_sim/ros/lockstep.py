@@ -59,7 +59,7 @@ class LockstepChannel(RosChannel):
             senders = sorted(frames)
             lengths = [len(frames[sender]) for sender in senders]
             verdict = self.model.arbitrate(slot, senders, lengths, self.answers.position)
-            self._observers.judged(slot, self.answers, frames, verdict)
+            self._observers.arbitrated(slot, self.answers, frames, verdict)
             slot += 1
 
     def _open(self, slot: int, frames: dict[int, bytes], verdict: Verdict | None) -> None:

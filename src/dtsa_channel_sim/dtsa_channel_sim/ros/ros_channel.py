@@ -98,11 +98,6 @@ class RosChannel:
         """The run's id."""
         return self._identity.number
 
-    @property
-    def unusable(self) -> int:
-        """Number of messages that the channel has dropped."""
-        return self.intake.total
-
     def dropped(self) -> dict[str, int]:
         """Return the number of messages and frames that the channel and the agents have dropped, by reason."""
         total = dict(self.intake.counts)
@@ -145,28 +140,28 @@ class RosChannel:
         :raises ConfigError: when two do not fit together, or another channel is there.
         :raises LocalProtocolError: when some do not answer in time.
         """
-        with self._other_channels() as look_for_others:
+        with self._watch_other_channels() as check_others:
 
             def call() -> None:
                 data = self._calling
                 self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, slot=names.FIRST_CALL, data=data))
 
-            def look() -> set[int]:
-                self._hear_processes()
-                look_for_others()
+            def awaited() -> set[int]:
+                self._read_processes()
+                check_others()
                 done = self.roster.complete(time.monotonic(), absent)
                 return set() if done else set(self.roster.missing) - absent or {0}
 
-            self.roster.closed = self._await_all(stop, call, look, _CALL_NS)
+            self.roster.closed = self._await_all(stop, call, awaited, _CALL_NS)
         return self.roster.closed
 
-    def _await_all(self, stop: object, call: Callable[[], None], look: Callable[[], set[int]], wait_ns: int) -> bool:
+    def _await_all(self, stop: object, call: Callable[[], None], awaited: Callable[[], set[int]], wait_ns: int) -> bool:
         """Call again and again until no agent is awaited any more; return False when stopped.
 
         :raises LocalProtocolError: when some do not answer in time.
         """
         patience, repeat = Patience(), 0.0
-        while awaited := look():
+        while agents := awaited():
             if stop:
                 return False
             now = time.monotonic()
@@ -177,40 +172,40 @@ class RosChannel:
             self._housekeeping()
             if patience.spent_s() > self._startup_s:
                 raise LocalProtocolError(
-                    f"{agent_names(awaited)} did not report within {self._startup_s:g} s: dead or hung?"
+                    f"{agent_names(agents)} did not report within {self._startup_s:g} s: dead or hung?"
                 )
         return True
 
     @contextmanager
-    def _other_channels(self) -> Iterator[Callable[[], None]]:
+    def _watch_other_channels(self) -> Iterator[Callable[[], None]]:
         """Listen to the channel's own topic; give a function that checks what others publish there."""
         topic = self._publisher.topic_name
         feed = Feed(self.node, Slot, topic, names.lockstep_qos(), intake=self.intake)
-        heard: dict[int, float] = {}  # by run: when it was first heard
+        first_s: dict[int, float] = {}  # by run: when its first message came
 
-        def look() -> None:
+        def check() -> None:
             for _ in range(_MOST_PROCESSES):
                 message = feed.take()
                 if message is None:
                     return
-                if message.run in (0, self.run_id) or len(heard) >= _MOST_PROCESSES:
+                if message.run in (0, self.run_id) or len(first_s) >= _MOST_PROCESSES:
                     continue
                 with self.intake.guard():
                     checks.check_slot(message, self.agents)
                     now = time.monotonic()
-                    waited = now - heard.setdefault(message.run, now)
-                    others = ", ".join(self._other_nodes(topic)) if waited > _OTHER_CHANNEL_S else ""
+                    waited = now - first_s.setdefault(message.run, now)
+                    others = ", ".join(self._channel_nodes(topic)) if waited > _OTHER_CHANNEL_S else ""
                     # The graph may know of a publisher before it knows the name of its node.
                     if others and (_UNNAMED not in others or waited > _OTHER_CHANNEL_S + _NAME_S):
                         raise ConfigError("run", str(self._identity), f"no other channel on {topic}; there is {others}")
 
         try:
-            yield look
+            yield check
         finally:
             feed.close()
             self.node.destroy_subscription(feed.subscription)
 
-    def _other_nodes(self, topic: str) -> list[str]:
+    def _channel_nodes(self, topic: str) -> list[str]:
         """Return the nodes that publish on a topic beside this one."""
         nodes = [
             _UNNAMED if "UNKNOWN_" in info.node_name else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
@@ -242,8 +237,8 @@ class RosChannel:
             b"".join(frames), b"" if mask is None else pack_received(mask),
         ))  # fmt: skip
 
-    def _hear_processes(self) -> None:
-        """Process what processes say about themselves.
+    def _read_processes(self) -> None:
+        """Process the messages of processes about themselves.
 
         :raises ConfigError: before the run has begun, when two do not fit together.
         """
@@ -267,9 +262,9 @@ class RosChannel:
         self._publisher.publish(Slot(run=self.run_id, phase=Slot.REFUSE, data=data))
 
     def _meet_processes(self) -> None:
-        """Process what processes say about themselves, and decide about those that came late."""
-        self._hear_processes()
-        for process, error in self.roster.settle(time.monotonic(), self.lost) if self.roster.closed else ():
+        """Process the messages of processes about themselves, and decide about those that came late."""
+        self._read_processes()
+        for process, error in self.roster.refuse_rivals(time.monotonic(), self.lost) if self.roster.closed else ():
             self._refuse(process, error)
 
     def _housekeeping(self) -> None:
@@ -321,4 +316,4 @@ class RosChannel:
             if self._publisher.wait_for_all_acked(Duration(seconds=REPEAT_S)):
                 break
             self._publish_end()
-        self._hear_processes()  # they end with their last counts
+        self._read_processes()  # they end with their last counts

@@ -29,7 +29,7 @@ from .answers import Accounts, Answers
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s
 _LEFT_OVER_S = 3.0  # agents whose channel has gone end within this time
-_MOST_STRANGERS = 256
+_MOST_OTHERS = 256  # processes of other runs, or for the same agents
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 _RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
 _ROUNDS, _LONGEST_S = 20, 0.5  # of one measurement
@@ -46,17 +46,14 @@ class Member:
     process: int
     node: str
     ids: tuple[int, ...]
-    heard_s: float  # monotonic, when it last told about itself
+    heard_s: float  # monotonic, when its last message about itself came
     sender: bytes | None  # participant of all its messages; None: not known
+    publisher: PublisherGuard
     dropped: dict[str, int] = field(default_factory=dict)
-    publisher: PublisherGuard = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.publisher = PublisherGuard(self.sender)
 
 
 class Roster:
-    """Collects what the processes say about themselves before slot 0, and keeps out those that do not fit.
+    """Collects what processes publish about themselves before slot 0, and keeps out those that do not fit.
 
     All must share the settings ``agreed``. Times are s, monotonic; ``sender`` is the sender of a message, None: not
     known; ``absent`` are ids of agents that are not waited for.
@@ -76,7 +73,7 @@ class Roster:
 
     @property
     def missing(self) -> list[int]:
-        """Ids of the agents whose processes have not told about themselves."""
+        """Ids of the agents whose processes are not known yet."""
         return [agent for agent in range(1, self._agents + 1) if agent not in self._of]
 
     def complete(self, now_s: float, absent: Set[int] = frozenset()) -> bool:
@@ -87,7 +84,7 @@ class Roster:
                 self._replace(rival)
         return not self._rivals and not set(self.missing) - absent
 
-    def settle(self, now_s: float, absent: Set[int]) -> list[tuple[int, ConfigError]]:
+    def refuse_rivals(self, now_s: float, absent: Set[int]) -> list[tuple[int, ConfigError]]:
         """Decide about processes that came while the run was under way; return those refused, and why."""
         refused = []
         for process, (rival, since_s) in list(self._rivals.items()):
@@ -102,7 +99,7 @@ class Roster:
         return refused
 
     def hear(self, message: Process, now_s: float, sender: bytes | None) -> None:
-        """Process what a process says about itself.
+        """Process a message of a process about itself.
 
         :raises ConfigError: if it cannot take part, naming setting, both values and node.
         :raises BadMessage: for a message that cannot be, or of another run.
@@ -125,14 +122,15 @@ class Roster:
                 raise self._conflict(rival, taken)  # both are alive
 
     def _meet(self, message: Process, now_s: float, sender: bytes | None) -> Member:
-        """A process tells about itself for the first time."""
+        """A process publishes about itself for the first time."""
         rival = self._rivals.get(message.process)
         if rival is not None:
             return rival[0]
-        member = Member(message.process, message.node, tuple(message.agent), now_s, sender)
+        guard = PublisherGuard(sender)
+        member = Member(message.process, message.node, tuple(message.agent), now_s, sender, guard)
         self._compare(message)
         if any(agent in self._of for agent in member.ids):
-            if len(self._rivals) >= _MOST_STRANGERS:
+            if len(self._rivals) >= _MOST_OTHERS:
                 raise BadMessage(checks.UNKNOWN, "too many processes for the same agents")
             self._rivals[member.process] = (member, now_s)
         else:
@@ -184,7 +182,7 @@ class Roster:
 
         :raises ConfigError: if it stays.
         """
-        if self.closed or len(self._left_over) >= _MOST_STRANGERS:
+        if self.closed or len(self._left_over) >= _MOST_OTHERS:
             return
         since_s = self._left_over.setdefault(message.process, now_s)
         if now_s - since_s > _LEFT_OVER_S:
@@ -193,19 +191,11 @@ class Roster:
 
     def check_sender(self, ids: Any, now_s: float, sender: bytes | None) -> None:
         """Check that a message can be from the process that has some agents."""
-        member = self._groups.get(ids.tobytes())
-        if member is None:
-            raise BadMessage(checks.UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
-        if not member.publisher.admits(now_s, sender):
-            raise BadMessage(checks.OTHER_SENDER, f"a message for {agent_names(ids)} that is not of {member.node}")
+        _admit(self._groups.get(ids.tobytes()), lambda: f"a message for {agent_names(ids[:8])}", now_s, sender)
 
     def check_frame(self, agent: int, now_s: float, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
-        member = self._of.get(agent)
-        if member is None:
-            raise BadMessage(checks.UNKNOWN, f"a frame of cf{agent}, which no process has")
-        if not member.publisher.admits(now_s, sender):
-            raise BadMessage(checks.OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
+        _admit(self._of.get(agent), lambda: f"a frame of cf{agent}", now_s, sender)
 
     def dropped(self) -> dict[str, int]:
         """Return the number of messages that all processes have dropped, by reason."""
@@ -213,6 +203,13 @@ class Roster:
         for member in self._members.values():
             checks.add_counts(total, member.dropped)
         return total
+
+
+def _admit(member: Member | None, what: Callable[[], str], now_s: float, sender: bytes | None) -> None:
+    if member is None:
+        raise BadMessage(checks.UNKNOWN, f"{what()}, which no process has")
+    if not member.publisher.admits(now_s, sender):
+        raise BadMessage(checks.OTHER_SENDER, f"{what()} that is not of {member.node}")
 
 
 def _key(ids: tuple[int, ...]) -> bytes:

@@ -130,7 +130,7 @@ class Diagnostics(ChannelObserver):
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._ticks = 0
 
-    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         self._counts[verdict.outcome] += 1
 
     def idle(self, status: ChannelStatus) -> None:

@@ -187,7 +187,7 @@ class FramesOnAir:
             while waiting and waiting[0][1].asked_ns < at:
                 key, sent = waiting.popleft()
                 air.begin(key, sent.sender, sent.asked_ns, len(sent.data))
-            yield from air.settle(at)
+            yield from air.resolve(at)
 
     def _by_slots(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
         slots: dict[int, list[SentFrame]] = {}

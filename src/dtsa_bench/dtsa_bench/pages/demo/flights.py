@@ -144,7 +144,7 @@ class KillAgent(ChannelObserver):
         """The flight's processes are started."""
         self._children = children
 
-    def begun(self, at_s: float) -> None:
+    def start_known(self, at_s: float) -> None:
         self._begin_s = at_s
 
     def idle(self, status: ChannelStatus) -> None:
