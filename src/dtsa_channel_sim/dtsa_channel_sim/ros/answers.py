@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import isnan
 from operator import attrgetter
@@ -121,12 +121,13 @@ class Answers:
         self.missing -= count
         return True
 
-    def add_report(self, at: Places, count: int, offset_ns: Any, motion: Sequence[Array], **decided: Any) -> None:
-        """Add a report of real time, checked: start of slots or transmissions; track, velocity, command, goal."""
+    def add_report(self, at: Places, message: Fields, row: int) -> None:
+        """Add what some agents report for one slot, a row of a report; checked before."""
+        count, rows = len(message.agent), len(message.slot)
+        motion = [getattr(message, name).reshape(rows, -1)[row] for name in _MOTION]
         self._motion[:, at] = np.concatenate(motion).reshape(-1, count)
-        for name, values in decided.items():
-            getattr(self, name)[at] = values
-        self.offset_ns[at] = offset_ns
+        for name in (*_DECIDED, "offset_ns"):
+            getattr(self, name)[at] = getattr(message, name)[row * count : (row + 1) * count]
         self._goal_known[at] = self.answered[at] = True
         self.missing -= count
 
@@ -241,31 +242,18 @@ class Accounts:
         last = max(slots[-1] if slots else 0, max(message.heard_in.tolist(), default=0))
         if last > latest:
             raise BadMessage(SLOT, f"{agent_names(message.agent)} reported slot {last}, which has not begun")
-        motion = [getattr(message, name).reshape(len(slots), -1) for name in _MOTION] if slots else []
         newest = -1
         for row, slot in enumerate(slots):
             if slot <= self._closed:
                 self.missed += count
                 continue
             book = self[slot]
-            if book.answered[at].any():
-                continue  # reported twice
-            part = slice(row * count, (row + 1) * count)
-            decided = {name: getattr(message, name)[part] for name in _DECIDED}
-            book.add_report(at, count, message.offset_ns[part], [planes[row] for planes in motion], **decided)
-            newest = slot
-        if len(message.heard_sender):
-            self._add_received(message, at, count)
-        return newest
-
-    def _add_received(self, message: Fields, at: Places, count: int) -> None:
-        """Add the frames that agents received, by the slot here; what was not delivered to them is left out."""
-        rows = message.heard_by.reshape(-1, -(-count // 8))
-        masks = np.unpackbits(rows, axis=1, count=count, bitorder="little").astype(np.bool_)
-        columns = (message.heard_slot, message.heard_sender, message.heard_in, message.heard_ns)
-        for slot, sender, here, at_ns, mask in zip(*(column.tolist() for column in columns), masks, strict=True):
+            if not book.answered[at].any():  # else reported twice
+                book.add_report(at, message, row)
+                newest = slot
+        for slot, sender, here, at_ns, mask in received_in(message):
             delivered = self._delivered.get((slot, sender))
-            if delivered is None:
+            if delivered is None:  # it was not sent to any receiver
                 continue
             receipts = self._receipts.setdefault(max(here, self._closed + 1), {})
             if (slot, sender) not in receipts:
@@ -273,6 +261,7 @@ class Accounts:
                 receipts[slot, sender] = FrameReceipt(slot, sender, delivered.data, delivered.arrival_ns, never)
             times = receipts[slot, sender].at_ns
             times[at] = np.where(mask & delivered.received[at], max(0, at_ns), times[at])
+        return newest
 
     def close(self, slot: int) -> None:
         """A slot is over: its account and what is too old is forgotten."""
@@ -285,6 +274,15 @@ class Accounts:
     def receipts(self, slot: int) -> list[FrameReceipt]:
         """Return the frames that agents received during a slot, as far as they have reported."""
         return list(self._receipts.get(slot, {}).values())
+
+
+def received_in(message: Fields) -> Iterator[tuple[int, int, int, int, NDArray[np.bool_]]]:
+    """Give the frames that the agents of a report received: slot, sender, slot here, ns, and by which of them."""
+    count = len(message.agent)
+    rows = message.heard_by.reshape(-1, -(-count // 8))
+    masks = np.unpackbits(rows, axis=1, count=count, bitorder="little").astype(np.bool_)
+    columns = (message.heard_slot, message.heard_sender, message.heard_in, message.heard_ns)
+    return zip(*(column.tolist() for column in columns), masks, strict=True)
 
 
 def _check_report(message: Fields, steps: int) -> None:
