@@ -112,8 +112,8 @@ def run(args: argparse.Namespace) -> int:
 
     clear_hindrances(os.environ)
     from dtsa_agent.stop import Stop
-    from dtsa_bench.flights.agents import process_count
     from dtsa_bench.flights.flight import fly
+    from dtsa_bench.flights.options import process_count
 
     options = FlightOptions(
         processes=process_count(args.processes, config.swarm.agents),

@@ -53,10 +53,9 @@ from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .agents import CHANNEL_NICE, agent_processes
 from .children import Children
 from .domain import ros_domain
-from .options import FlightOptions
+from .options import CHANNEL_NICE, FlightOptions, agent_processes
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import LateStart, RealtimeSupervisor, Supervisor
@@ -199,7 +198,7 @@ def _fly(
         shown = FlightProgress(progress, measurement, channel)
         supervisor: Supervisor | RealtimeSupervisor = Supervisor(children)
         if isinstance(channel, RealtimeChannel):
-            supervisor = RealtimeSupervisor(children, channel, measurement, progress.say, options.respawn, late)
+            supervisor = RealtimeSupervisor(children, channel, measurement, progress.print_line, options.respawn, late)
             supervisor.follow_parameters(node)
         channel.observe(supervisor, shown, *observers)
         limit_s = options.wall_limit_s(flight.run_config.limits.timeout_s)

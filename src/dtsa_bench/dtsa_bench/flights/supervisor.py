@@ -52,11 +52,11 @@ class RealtimeSupervisor(ChannelObserver):
         children: Children,
         channel: RealtimeChannel,
         measurement: FlightMeasurement,
-        say: Callable[[str], None],
+        print_line: Callable[[str], None],
         respawn_s: float | None = None,
         late: Sequence[LateStart] = (),
     ) -> None:
-        self._children, self._channel, self._measurement, self._say = children, channel, measurement, say
+        self._children, self._channel, self._measurement, self._print = children, channel, measurement, print_line
         self._respawn_s = respawn_s
         self._late = sorted(late, key=lambda start: start.after_s)
         self._dead: list[tuple[float, Child]] = []  # time.monotonic() at which each is started again
@@ -67,28 +67,28 @@ class RealtimeSupervisor(ChannelObserver):
 
     def start_known(self, at_s: float) -> None:
         if text := tight(self._channel):
-            self._say(text)
+            self._print(text)
 
     def idle(self, status: ChannelStatus) -> None:
         begin_s = self._measurement.begin_s
         for child in self._children.ended():
             if not begin_s:
                 self._children.check()
-            self._miss(child)
+            self._report_end(child)
         while self._dead and time.monotonic() >= self._dead[0][0]:
-            self._start_again(self._dead.pop(0)[1])
+            self._restart(self._dead.pop(0)[1])
         while self._late and begin_s and time.monotonic() - begin_s >= self._late[0].after_s:
             start = self._late.pop(0)
             start.start()
-            self._say(f"{agent_names([start.agent])} is started")
+            self._print(f"{agent_names([start.agent])} is started")
 
-    def _miss(self, child: Child) -> None:
+    def _report_end(self, child: Child) -> None:
         """Takes note that a process has ended.
 
         :raises NodeError: when nobody is left.
         """
         left = not child.process.returncode
-        self._say(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
+        self._print(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
         for agent in child.agents:
             self._channel.lose(agent)
         if self._respawn_s is not None and not left:
@@ -97,11 +97,11 @@ class RealtimeSupervisor(ChannelObserver):
         if len(self._channel.lost) == self._channel.agents and not self._dead and not self._late:
             raise NodeError(f"nobody is left: {describe_end(child)}")
 
-    def _start_again(self, child: Child) -> None:
+    def _restart(self, child: Child) -> None:
         """Starts the program of some agents again; their vehicles have gone on hovering where they were."""
         places = [value for agent in child.agents for value in self._channel.last_place(agent)]
-        self._children.again(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
-        self._say(f"{child.name} is started again")
+        self._children.restart(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
+        self._print(f"{child.name} is started again")
 
     def follow_parameters(self, node: Node) -> None:
         """Let parameters of the channel's node kill and start the processes of agents, as faults would."""
@@ -133,7 +133,7 @@ class RealtimeSupervisor(ChannelObserver):
         check_joinable(self._measurement.metrics.run.swarm.policy)
         self._dead = [entry for entry in self._dead if entry[1] is not child]
         self._measurement.metrics.awaited.update(child.agents)
-        self._start_again(child)
+        self._restart(child)
 
     def _child(self, agent: int) -> Child | None:
         return next((child for child in self._children.all if agent in child.agents), None)
@@ -141,9 +141,9 @@ class RealtimeSupervisor(ChannelObserver):
     def agents_back(self, agents: list[int]) -> None:
         again = "" if self._new.issuperset(agents) else " again"
         self._new.difference_update(agents)
-        self._say(f"{agent_names(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
+        self._print(f"{agent_names(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
 
     def agent_silent(self, agent: int) -> None:
         known = {agent for child in self._children.all if child.process.poll() is not None for agent in child.agents}
         if agent not in known | {start.agent for start in self._late}:
-            self._say(f"{agent_names([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")
+            self._print(f"{agent_names([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")

@@ -114,7 +114,7 @@ class _Station:
         mission.connect()
         swarm = mission.find_places(run.swarm)
         if swarm != run.swarm:
-            self.progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
+            self.progress.print_line(f"not where they would begin: exchange of roles, places {swarm.places}")
             run = dataclasses.replace(run, swarm=swarm)
         self.progress.show("agents")
         self._start_agents(run)
@@ -153,7 +153,7 @@ class _Station:
                 end_process(self._recorder.all[0].process, RECORDER_END_S)
                 bag = self._directory / MISSION_BAG
                 if not (bag / "metadata.yaml").is_file():
-                    self.progress.say(
+                    self.progress.print_line(
                         f"the recorder did not close {bag}: `{program()} recover {bag}` saves what it holds"
                     )
                 if mission is not None:
@@ -244,7 +244,7 @@ def _exchange(
         assert isinstance(channel, RealtimeChannel)
         shown = FlightProgress(progress, measurement, channel)
         watch = MissionWatch(mission, channel, measurement.metrics if stop_on_crash else None)
-        channel.observe(watch, RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
+        channel.observe(watch, RealtimeSupervisor(agents, channel, measurement, progress.print_line), shown)
         try:
             channel.run(watch)
             ended.reason = ended.reason or channel.fell_behind
