@@ -121,7 +121,7 @@ def test_a_radio_senses_what_would_destroy_a_frame_there(frames, when, listener,
     for i, (sender, start, length) in enumerate(frames):
         line.begin(i, sender, start, length)
         others.append(OnAir.of(channel.config.airtime, sender, start, length))
-    probe = channel.medium(0).judge(0, OnAir(7, when, when, when + 1), others, places)
+    probe = channel.medium(0).resolve(0, OnAir(7, when, when, when + 1), others, places)
     assert line.busy(listener, when, places) != probe.received[listener - 1]
 
 

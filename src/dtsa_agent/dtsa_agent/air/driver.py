@@ -65,15 +65,10 @@ class LiveAgent:
     """
 
     def __init__(
-        self,
-        own: AgentSettings,
-        config: SwarmConfig,
-        port: DatagramPort,
-        watcher: Watcher | None = None,
-        vehicle: Vehicle | None = None,
-        log: Callable[[str], None] | None = None,
+        self, own: AgentSettings, config: SwarmConfig, port: DatagramPort, watcher: Watcher | None = None,
+        vehicle: Vehicle | None = None, log: Callable[[str], None] | None = None,
         show: Callable[[str], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if own.id > config.agents:
             raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
         check_joinable(config.policy)

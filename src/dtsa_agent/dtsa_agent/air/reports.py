@@ -26,13 +26,9 @@ class Reports:
     """
 
     def __init__(
-        self,
-        id: int,
-        slot_ms: float,
-        log: Callable[[str], None] | None,
-        now_ns: int,
+        self, id: int, slot_ms: float, log: Callable[[str], None] | None, now_ns: int,
         show: Callable[[str], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._id, self._slot_ms, self._log, self._show = id, slot_ms, log or (lambda line: None), show
         self._show_due_ns = now_ns
         self._state = self._printed = ""  # the present state, and the one that was printed last

@@ -49,14 +49,9 @@ class Membership:
     """
 
     def __init__(
-        self,
-        node: Node,
-        ids: Sequence[int],
-        settings: Mapping[str, Any],
-        swarm_namespace: str,
-        dropped_frames: Callable[[], dict[str, int]],
-        check_next: Callable[[Fields], None],
-    ) -> None:
+        self, node: Node, ids: Sequence[int], settings: Mapping[str, Any], swarm_namespace: str,
+        dropped_frames: Callable[[], dict[str, int]], check_next: Callable[[Fields], None],
+    ) -> None:  # fmt: skip
         self.run = 0  # the run's id; 0: none has begun yet
         self.intake = Intake(node.get_logger())
         self._agents, self._dropped_frames, self._check_next = int(settings["agents"]), dropped_frames, check_next

@@ -89,15 +89,9 @@ class RealtimeAgent:
     """
 
     def __init__(
-        self,
-        id: int,
-        config: SwarmConfig,
-        scenario: Scenario,
-        clock: ClockMap,
-        jitter_ns: float,
-        accepted: Callable[[int, int, int], None],
-        refused: Callable[[str], None],
-    ) -> None:
+        self, id: int, config: SwarmConfig, scenario: Scenario, clock: ClockMap, jitter_ns: float,
+        accepted: Callable[[int, int, int], None], refused: Callable[[str], None],
+    ) -> None:  # fmt: skip
         self.id, self.clock = id, clock
         self.swarm = make_swarm(config, scenario, local=[id])
         self.slot = -1  # the present one
@@ -195,20 +189,10 @@ class RealtimeNode(AgentsNode):
     mode = "realtime"
 
     def __init__(
-        self,
-        node: Node,
-        config: SwarmConfig,
-        ids: Sequence[int],
-        swarm_namespace: str = names.SWARM,
-        *,
-        authenticator: Authenticator | None = None,
-        clocks: Sequence[ClockMap] = (),
-        jitter_ns: float = 0.0,
-        align: bool = True,
-        flight_time_ns: int = 0,
-        priority: int = 0,
-        resume_at: Sequence[float] = (),
-    ) -> None:
+        self, node: Node, config: SwarmConfig, ids: Sequence[int], swarm_namespace: str = names.SWARM, *,
+        authenticator: Authenticator | None = None, clocks: Sequence[ClockMap] = (), jitter_ns: float = 0.0,
+        align: bool = True, flight_time_ns: int = 0, priority: int = 0, resume_at: Sequence[float] = (),
+    ) -> None:  # fmt: skip
         self.slot_ns, self._flight_ns = config.slot_ns, flight_time_ns
         self._authenticator, self._align = authenticator, align
         scenario = make_scenario(config)

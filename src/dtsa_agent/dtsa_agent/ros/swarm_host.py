@@ -84,14 +84,9 @@ def declare_ids(node: Node, agents: int) -> list[int]:
 
 
 def host_agents(
-    node: Node,
-    ids: Sequence[int],
-    config: SwarmConfig,
-    stop: Stop,
-    space: str = names.SWARM,
-    shared: bool = False,
+    node: Node, ids: Sequence[int], config: SwarmConfig, stop: Stop, space: str = names.SWARM, shared: bool = False,
     spaces: Sequence[str] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Declare the rest of the parameters and run agents until the end.
 
     :param ids: of the agents that live here, ascending.

@@ -130,16 +130,10 @@ def _check_policy(run: RunConfig, options: FlightOptions) -> None:
 
 
 def fly(
-    run: RunConfig,
-    out: str | Path,
-    options: FlightOptions | None = None,
-    stop: Stop | None = None,
-    label: str = "fly",
-    started: Callable[[Children], None] | None = None,
-    observers: Sequence[ChannelObserver] = (),
-    progress: ProgressLine | None = None,
-    on_domain: Callable[[int, Mapping[str, str]], None] | None = None,
-) -> Flight:
+    run: RunConfig, out: str | Path, options: FlightOptions | None = None, stop: Stop | None = None,
+    label: str = "fly", started: Callable[[Children], None] | None = None, observers: Sequence[ChannelObserver] = (),
+    progress: ProgressLine | None = None, on_domain: Callable[[int, Mapping[str, str]], None] | None = None,
+) -> Flight:  # fmt: skip
     """Carries out one flight; when this returns or raises, no process of it is left and its bag is closed.
 
     :param out: directory for the bag and the results; empty, or not there yet.
@@ -182,16 +176,9 @@ def fly(
 
 
 def _fly(
-    flight: RecordedFlight,
-    node: Node,
-    directory: Path,
-    children: Children,
-    progress: ProgressLine,
-    options: FlightOptions,
-    stop: Stop,
-    late: Sequence[LateStart],
-    observers: Sequence[ChannelObserver],
-) -> Flight:
+    flight: RecordedFlight, node: Node, directory: Path, children: Children, progress: ProgressLine,
+    options: FlightOptions, stop: Stop, late: Sequence[LateStart], observers: Sequence[ChannelObserver],
+) -> Flight:  # fmt: skip
     failure: DtsaError | None = None
     try:
         channel, measurement = flight.channel, flight.measurement

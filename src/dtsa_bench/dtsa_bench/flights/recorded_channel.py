@@ -48,15 +48,9 @@ class RecordedFlight:
     """
 
     def __init__(
-        self,
-        node: Node,
-        run: RunConfig,
-        directory: Path,
-        startup_s: float,
-        answer_s: float,
-        end_s: float = 4.0,
+        self, node: Node, run: RunConfig, directory: Path, startup_s: float, answer_s: float, end_s: float = 4.0,
         space: str = names.SWARM,
-    ) -> None:
+    ) -> None:  # fmt: skip
         identity = Run.draw(run.swarm.auth_session)
         agreed = agreed_settings(run.swarm, run.mode)
         if run.swarm.auth:  # the bag says in which session its frames are authentic

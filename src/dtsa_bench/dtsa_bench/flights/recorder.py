@@ -140,7 +140,9 @@ class FlightRecorder(ChannelObserver):
             self._accounts.resolve(verdict)
         if slot % self._view_slots == 0:
             motion = self._packer.pack(at, answers.position, answers.velocity)
-            self._pending += [(channel, data, at) for channel, data in zip(self._odometry, motion, strict=True)]
+            # Where an agent is that has not reported is not known: its report may come later, into the record alone.
+            reported = zip(self._odometry, motion, answers.answered, strict=True)
+            self._pending += [(channel, data, at) for channel, data, is_known in reported if is_known]
             self._pending.append((self._markers, self._packed.markers(slot, answers, verdict), at))
 
     def settings_changed(self, change: Change) -> None:

@@ -48,14 +48,9 @@ class RealtimeSupervisor(ChannelObserver):
     """
 
     def __init__(
-        self,
-        children: Children,
-        channel: RealtimeChannel,
-        measurement: FlightMeasurement,
-        print_line: Callable[[str], None],
-        respawn_s: float | None = None,
-        late: Sequence[LateStart] = (),
-    ) -> None:
+        self, children: Children, channel: RealtimeChannel, measurement: FlightMeasurement,
+        print_line: Callable[[str], None], respawn_s: float | None = None, late: Sequence[LateStart] = (),
+    ) -> None:  # fmt: skip
         self._children, self._channel, self._measurement, self._print = children, channel, measurement, print_line
         self._respawn_s = respawn_s
         self._late = sorted(late, key=lambda start: start.after_s)

@@ -38,12 +38,9 @@ class Sniffer:
     """
 
     def __init__(
-        self,
-        config: SwarmConfig,
-        port: PortSettings,
-        path: Path | None = None,
+        self, config: SwarmConfig, port: PortSettings, path: Path | None = None,
         log: Callable[[str], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._config, self._judge = config, Judge(config)
         self._datagrams = StationSettings(config, link_of(config, port.properties), authenticator(config))
         self._slots: dict[int, dict[int, tuple[int, bytes]]] = {}  # not judged yet: by sender, when it came, and what

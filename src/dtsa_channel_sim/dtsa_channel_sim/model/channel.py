@@ -75,12 +75,9 @@ class Channel:
         self._last = max(self._last, slot)
 
     def arbitrate(
-        self,
-        slot: int,
-        senders: Sequence[int],
-        lengths: Sequence[int] | None = None,
+        self, slot: int, senders: Sequence[int], lengths: Sequence[int] | None = None,
         positions: Positions | None = None,
-    ) -> Verdict:
+    ) -> Verdict:  # fmt: skip
         """Return who received what in one slot.
 
         :param slot: number of the slot, 0 or more; usually one after the other.
@@ -144,13 +141,9 @@ class Channel:
         return Verdict(SUCCESS, alone.senders, received, (missing,), (0,))
 
     def _many(
-        self,
-        slot: int,
-        follows: bool,
-        senders: tuple[int, ...],
-        lengths: Sequence[int] | None,
+        self, slot: int, follows: bool, senders: tuple[int, ...], lengths: Sequence[int] | None,
         positions: Positions | None,
-    ) -> Verdict:
+    ) -> Verdict:  # fmt: skip
         """Return the verdict on any number of frames, in full generality."""
         if not follows:
             self._near = []
@@ -164,7 +157,7 @@ class Channel:
         if not senders:
             return self._idle
         receptions = [
-            self._medium.judge(slot, on_air[k], on_air[:k] + on_air[k + 1 :], positions)
+            self._medium.resolve(slot, on_air[k], on_air[:k] + on_air[k + 1 :], positions)
             for k in range(first, len(on_air))
         ]
         return Verdict.of(senders, receptions)

@@ -82,7 +82,9 @@ class Medium:
         #: everywhere.
         self.everywhere = not self.needs_positions and self._groups is None
 
-    def judge(self, slot: int, frame: OnAir, others: Sequence[OnAir], positions: Positions | None = None) -> Reception:
+    def resolve(
+        self, slot: int, frame: OnAir, others: Sequence[OnAir], positions: Positions | None = None
+    ) -> Reception:
         """Return what became of one transmission among others that may overlap it, by the random numbers of a slot.
 
         :raises LocalProtocolError: when positions are needed and missing.

@@ -55,19 +55,10 @@ class RosChannel:
     mode = "lockstep"
 
     def __init__(
-        self,
-        node: Node,
-        channel: Channel,
-        steps: int,
-        waiting: int,
-        input: tuple[type, str],
-        referee: Referee | None = None,
-        swarm_namespace: str = names.SWARM,
-        startup_s: float = 60.0,
-        end_s: float = 4.0,
-        run: Run | None = None,
-        agreed: Mapping[str, Any] | None = None,
-    ) -> None:
+        self, node: Node, channel: Channel, steps: int, waiting: int, input: tuple[type, str],
+        referee: Referee | None = None, swarm_namespace: str = names.SWARM, startup_s: float = 60.0,
+        end_s: float = 4.0, run: Run | None = None, agreed: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
         self.node, self.model = node, channel
         self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
         self._identity = run or Run.draw()

@@ -143,16 +143,10 @@ class Feed:
     """
 
     def __init__(
-        self,
-        node: Node,
-        msg_type: Any,
-        topic: str,
-        qos: QoSProfile,
-        raw: bool = False,
-        intake: Intake | None = None,
-        admits: Callable[[Any, bytes | None], bool] | None = None,
+        self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, raw: bool = False,
+        intake: Intake | None = None, admits: Callable[[Any, bytes | None], bool] | None = None,
         read: Callable[[bytes], Any] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.subscription = node.create_subscription(
             msg_type, topic, self._refuse, qos, callback_group=_NoExecutor(), raw=True
         )

@@ -49,13 +49,9 @@ def descriptor(setting: Setting, read_only: bool) -> ParameterDescriptor:
 
 
 def declare_settings(
-    node: Node,
-    cls: type[Settings],
-    skip: Iterable[str] = (),
-    changeable: bool = False,
-    defaults: Mapping[str, Any] | None = None,
-    prefix: str = "",
-) -> dict[str, Any]:
+    node: Node, cls: type[Settings], skip: Iterable[str] = (), changeable: bool = False,
+    defaults: Mapping[str, Any] | None = None, prefix: str = "",
+) -> dict[str, Any]:  # fmt: skip
     """Declare a parameter for every setting of a class; return the values that the node was started with, by name.
 
     :param skip: fields that become no parameter.

@@ -61,7 +61,7 @@ class _RecordedMedium:
     def advance(self, slot: int) -> None:
         pass
 
-    def judge(self, slot: int, frame: OnAir, others: Any, positions: Any = None) -> Reception:
+    def resolve(self, slot: int, frame: OnAir, others: Any, positions: Any = None) -> Reception:
         return Reception(self._next[frame.sender].popleft(), 0, 0)
 
 
