@@ -104,20 +104,20 @@ class SimulatedDongle:
         try:
             self._socket.send(message)
         except OSError as error:
-            raise self._gone() from error
+            raise self._disconnected() from error
 
     def _receive(self, timeout_ms: int | None) -> bytes:
         if self._socket is None:
-            raise self._gone()
+            raise self._disconnected()
         try:
             self._socket.settimeout(timeout_ms / 1000 if timeout_ms else None)
             data = self._socket.recv(128)
         except TimeoutError as error:
             raise usb.core.USBTimeoutError("no answer", None, errno.ETIMEDOUT) from error
         except OSError as error:
-            raise self._gone() from error
+            raise self._disconnected() from error
         if not data:
-            raise self._gone()
+            raise self._disconnected()
         return data
 
     def _await(self, kind: int, timeout_ms: int | None) -> bytes:
@@ -129,7 +129,7 @@ class SimulatedDongle:
             if message[0] == kind:
                 return message[1:]
 
-    def _gone(self) -> usb.core.USBError:
+    def _disconnected(self) -> usb.core.USBError:
         self.dispose()
         time.sleep(GONE_S)
         return usb.core.USBError("the simulated radio has gone", None, errno.ENODEV)

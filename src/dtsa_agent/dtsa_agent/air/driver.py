@@ -36,7 +36,7 @@ _STATUS_NS = 100_000_000  # from one check of the station's status to the next
 _BURST = 16  # datagrams that are read at a time: whatever comes, the own slots go on
 
 
-class Vehicle:
+class AgentVehicle:
     """The vehicle of one agent: the point mass of the simulator, unless a subclass flies another one."""
 
     def is_ready(self) -> bool:
@@ -66,7 +66,7 @@ class LiveAgent:
 
     def __init__(
         self, own: AgentSettings, config: SwarmConfig, port: DatagramPort, watcher: Watcher | None = None,
-        vehicle: Vehicle | None = None, log: Callable[[str], None] | None = None,
+        vehicle: AgentVehicle | None = None, log: Callable[[str], None] | None = None,
         show: Callable[[str], None] | None = None,
     ) -> None:  # fmt: skip
         if own.id > config.agents:
@@ -80,7 +80,7 @@ class LiveAgent:
         self.swarm = make_swarm(config, local=[own.id])
         self.clock = ClockMap(own.clock_offset_ns, own.clock_drift_ppb)
         self._header = port.properties.header(config.auth) if port.properties.varies else None
-        self._vehicle = vehicle or Vehicle()
+        self._vehicle = vehicle or AgentVehicle()
         self.station = self._start()
         self.slot = -1  # the present slot
         self.counts = AgentCounts()
@@ -95,7 +95,7 @@ class LiveAgent:
         self._signals = 0
 
     def _start(self) -> Station:
-        now, senses = self.clock.local_ns(time.monotonic_ns()), type(self._vehicle).sense is not Vehicle.sense
+        now, senses = self.clock.local_ns(time.monotonic_ns()), type(self._vehicle).sense is not AgentVehicle.sense
         sense = (lambda slot: self._vehicle.sense(self.swarm)) if senses else None
         return Station(
             self.swarm, self._settings, now, sense, self, every_frame=bool(self.watcher or self._header is not None)

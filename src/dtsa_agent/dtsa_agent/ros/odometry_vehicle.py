@@ -19,7 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from dtsa_agent.air.driver import LiveAgent, Vehicle
+from dtsa_agent.air.driver import AgentVehicle, LiveAgent
 from dtsa_agent.air.port import open_port, settings_class
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
@@ -73,7 +73,7 @@ class VehicleSettings(Settings):
     )
 
 
-class OdometryVehicle(Vehicle):
+class OdometryVehicle(AgentVehicle):
     """A vehicle that publishes odometry and follows velocities.
 
     Odometry that cannot be, or lies where the vehicle cannot have got since the last accepted one, is counted and not

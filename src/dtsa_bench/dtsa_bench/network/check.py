@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtsa_agent.air.driver import Vehicle
+from dtsa_agent.air.driver import AgentVehicle
 from dtsa_agent.air.port import PortProperties, link_of
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.core import SwarmConfig
@@ -34,7 +34,7 @@ def _settled_after(config: SwarmConfig) -> int:
     return (2 * config.main_every if config.policy_row.probation else 1) * config.agents
 
 
-class HeldVehicle(Vehicle):
+class HeldVehicle(AgentVehicle):
     """A vehicle that stays where it is, whatever its agent wants; it is never at its goal, so that all speak alike."""
 
     def sense(self, swarm: Swarm) -> None:
@@ -51,9 +51,9 @@ class HeldVehicle(Vehicle):
 class _OtherAgent:
     """What was heard of another agent."""
 
-    left: bool = False  # has said that it leaves: its check is over
-    new: bool = True  # on probation: it speaks at its anchors only, or in turns of which others need not know yet
-    expected: set[int] = field(default_factory=set)  # slots in which it was taken for the sender
+    left: bool = False  # has announced that it leaves: its check is over
+    new: bool = True  # on probation: it sends at its anchors only, or in turns of which others need not know yet
+    expected: set[int] = field(default_factory=set)  # slots in which it was to send
     came: set[int] = field(default_factory=set)  # slots of its frames
     in_time: set[int] = field(default_factory=set)
     delays_ns: list[int] = field(default_factory=list)
@@ -65,7 +65,7 @@ class _OtherAgent:
 
 
 class Check:
-    """A watcher of an agent that only listens and speaks."""
+    """A watcher of an agent whose vehicle is held."""
 
     def __init__(self, agent: int, config: SwarmConfig, port: PortProperties) -> None:
         self._agent, self._config = agent, config
@@ -73,9 +73,9 @@ class Check:
         self._others: dict[int, _OtherAgent] = {}
         self._refused: Counter[str] = Counter()
         self._last = -1
-        self._slots = 0  # since it began, or began anew
+        self._slots = 0  # since it began or restarted
         self._settled = _settled_after(config)
-        self._expects = False  # whether the policy says at all who is to send
+        self._expects = False  # whether the policy expects senders at all
 
     def slot(self, record: SlotRecord) -> None:
         """A slot is over."""
@@ -101,7 +101,7 @@ class Check:
         return self._others.setdefault(agent, _OtherAgent())
 
     def _read(self, other: _OtherAgent, datagram: bytes) -> None:
-        """Whether the sender is new, and whom it says to hear."""
+        """Note whether the sender is new, and which agents it announces to hear."""
         parsed = self._datagrams.read(datagram)
         other.left, _, other.new = condition_in(parsed.frame)
         if other.left or not self._datagrams.names:  # an agent that leaves need hear nobody

@@ -95,10 +95,10 @@ class Channel:
             if len(senders) == 1:
                 alone = self._alone.get(senders[0])
                 if alone is not None:
-                    return alone if self._plain else self._one(slot, senders[0], alone)
+                    return alone if self._plain else self._arbitrate_one(slot, senders[0], alone)
             elif not len(senders):
                 return self._idle
-        return self._many(slot, slot > last, self._checked(senders), lengths, positions)
+        return self._arbitrate_many(slot, slot > last, self._check_senders(senders), lengths, positions)
 
     def medium(self, slot: int) -> Medium:
         """Return the medium of a slot, with the settings that hold in it."""
@@ -130,7 +130,7 @@ class Channel:
         self._simple = self._shared and not epoch.config.jam
         self._plain = self._simple and self._losses.none
 
-    def _one(self, slot: int, sender: int, alone: Verdict) -> Verdict:
+    def _arbitrate_one(self, slot: int, sender: int, alone: Verdict) -> Verdict:
         """Return the verdict on the only frame of a slot, everybody in reach."""
         lost = self._losses.lost(slot, sender)
         received = ~lost
@@ -140,7 +140,7 @@ class Channel:
             return alone
         return Verdict(SUCCESS, alone.senders, received, (missing,), (0,))
 
-    def _many(
+    def _arbitrate_many(
         self, slot: int, follows: bool, senders: tuple[int, ...], lengths: Sequence[int] | None,
         positions: Positions | None,
     ) -> Verdict:  # fmt: skip
@@ -151,7 +151,7 @@ class Channel:
         if self._shared and not self._near and len(senders) > 1:
             others = (agents - 1,) * len(senders)
             return Verdict(COLLISION, senders, np.zeros((len(senders), agents), np.bool_), (0,) * len(senders), others)
-        on_air = [*self._near, *self._sent(slot, senders, lengths)]
+        on_air = [*self._near, *self._transmissions(slot, senders, lengths)]
         first, end_ns = len(self._near), (slot + 1) * self.config.slot_ns
         self._near = [frame for frame in on_air if frame.end_ns > end_ns]
         if not senders:
@@ -162,7 +162,7 @@ class Channel:
         ]
         return Verdict.of(senders, receptions)
 
-    def _sent(self, slot: int, senders: tuple[int, ...], lengths: Sequence[int] | None) -> list[OnAir]:
+    def _transmissions(self, slot: int, senders: tuple[int, ...], lengths: Sequence[int] | None) -> list[OnAir]:
         """Return the transmissions of a slot: all start with it."""
         start = slot * self.config.slot_ns
         if lengths is None:
@@ -173,7 +173,7 @@ class Channel:
             OnAir.of(self._airtime, sender, start, int(length)) for sender, length in zip(senders, lengths, strict=True)
         ]
 
-    def _checked(self, senders: Sequence[int]) -> tuple[int, ...]:
+    def _check_senders(self, senders: Sequence[int]) -> tuple[int, ...]:
         ids = tuple(int(sender) for sender in senders)
         for sender in ids:
             if sender not in self._alone:

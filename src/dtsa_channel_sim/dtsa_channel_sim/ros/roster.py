@@ -107,7 +107,7 @@ class Roster:
         checks.check_process(message, self._agents)
         message.node = checks.plain(message.node)
         if message.run != self._run:
-            self._hear_other(message, now_s)
+            self._note_other_run(message, now_s)
             raise BadMessage(checks.OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
         member = self._members.get(message.process) or self._meet(message, now_s, sender)
         if member.sender != sender:
@@ -177,7 +177,7 @@ class Roster:
             self._agreed.update((name, given[name]) for name in further)
             self._agreed_by.update(dict.fromkeys(further, message.node))
 
-    def _hear_other(self, message: Process, now_s: float) -> None:
+    def _note_other_run(self, message: Process, now_s: float) -> None:
         """A process of another run answers our call.
 
         :raises ConfigError: if it stays.
