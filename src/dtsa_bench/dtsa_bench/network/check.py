@@ -35,13 +35,7 @@ def _settled_after(config: SwarmConfig) -> int:
 
 
 class HeldVehicle(AgentVehicle):
-    """A vehicle that stays where it is, whatever its agent wants; it is never at its goal, so that all speak alike."""
-
-    def sense(self, swarm: Swarm) -> None:
-        """An agent at its goal would rest, and speak seldom: it says that it is below it."""
-        away = swarm.goal[:, 0] - swarm.position[:, 0]
-        if float(away @ away) <= swarm.config.r_min**2:
-            swarm.position[2, 0] -= 2.0 * swarm.config.r_min
+    """A vehicle that stays where it is, whatever its agent wants."""
 
     def fly(self, swarm: Swarm, slot: int) -> None:
         """Nothing."""
