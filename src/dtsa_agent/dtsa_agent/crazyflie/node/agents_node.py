@@ -26,15 +26,16 @@ from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.crazyflie.state import Vector, rotate
 from dtsa_agent.keys import authenticator
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, swarm_wide_node
-from dtsa_agent.ros.common.process.loop import Feed, Stop
-from dtsa_agent.ros.common.process.node_process import run_node
-from dtsa_agent.ros.common.process.priority import take_priority
-from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, OnePublisher, Unusable, check_odometry
-from dtsa_agent.ros.common.wire.messages import Fields
+from dtsa_agent.priority import set_realtime
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import OTHER_SENDER, BadMessage, PublisherGuard, check_odometry
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.messages import Fields
+from dtsa_agent.ros.common.node_process import run_node
+from dtsa_agent.ros.common.parameters import check_parameters, declare_settings, swarm_wide_node
 from dtsa_agent.ros.realtime import RealtimeNode
 from dtsa_agent.ros.swarm_host import declare_ids, declare_swarm
+from dtsa_agent.stop import Stop
 
 from .interfaces import STOP_HERE, VelocityWorld
 
@@ -134,7 +135,7 @@ class CrazyflieAgents(RealtimeNode):
         intake = self.membership.intake
         self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=intake)
         self._inputs = [Feed(node, Odometry, f"/{name}/{names.ODOMETRY}", LATEST, intake=intake) for name in vehicles]
-        self._bridges = [OnePublisher() for _ in vehicles]  # sources of odometry
+        self._bridges = [PublisherGuard() for _ in vehicles]  # sources of odometry
         self._outputs = [node.create_publisher(VelocityWorld, f"/{name}/cmd_velocity_world", 1) for name in vehicles]
 
     def _sense(self) -> None:
@@ -153,11 +154,11 @@ class CrazyflieAgents(RealtimeNode):
     def _accept(self, index: int, message: Odometry, feed: Feed) -> None:
         """Check and store a vehicle's odometry. Without any for a while it gets no commands, and the bridge holds it.
 
-        :raises Unusable: it is not from the bridge that sent it so far, or cannot be.
+        :raises BadMessage: it is not from the bridge that sent it so far, or cannot be.
         """
         check_odometry(message)
         if not self._bridges[index].admits(time.monotonic(), feed.sender):
-            raise Unusable(OTHER_SENDER, f"odometry of {self._names[index]} from two publishers")
+            raise BadMessage(OTHER_SENDER, f"odometry of {self._names[index]} from two publishers")
         place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
         x, y, z = self._origin if message.header.frame_id == WORLD else (0.0, 0.0, 0.0)
         self._measured[:, index] = place.x - x, place.y - y, place.z - z
@@ -203,7 +204,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         config = declare_swarm(node)
         ids = declare_ids(node, config.agents)
         station = CrazyflieAgentsSettings(**declare_settings(node, CrazyflieAgentsSettings))
-        take_priority(station.priority)
+        set_realtime(station.priority)
         check_parameters(node)
         vehicles = station.vehicles.split() or [f"cf{k}" for k in range(1, config.agents + 1)]
         if len(vehicles) != config.agents:
