@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.experiments.sweep import run_config as _run_config
-from dtsa_bench.log.arrays import LogBuilder
-from dtsa_bench.log.flight_log import FlightLog
+from dtsa_bench.log.flight_log import FlightLog, log_of_flight
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import simulate as _simulate
 
@@ -40,10 +39,7 @@ def simulate(config: RunConfig | None = None, *, trace: bool = True, **settings:
     if config is not None and settings:
         raise ConfigError("settings", sorted(settings), "none beside a config")
     run = run_config(**settings) if config is None else config
-    flight = _simulate(run, log=trace, frames=trace)
-    if flight.log is not None:
-        return flight.to_log()
-    return FlightLog(**LogBuilder(run).fields(flight.swarm.track), results=flight.summary(), is_kept=False)
+    return log_of_flight(_simulate(run, log=trace, frames=trace))
 
 
 def open(path: str | Path) -> FlightLog:

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Scenario, Swarm
+from dtsa_agent.core import Scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.frame import EXTENT_M
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_bench.runs.config import RunConfig
-from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
+from dtsa_channel_sim.model.verdict import OUTCOMES
 
 UNKNOWN = len(OUTCOMES)  # outcome of a slot of which not all that could have sent have told
 PRESENT, LEAVING, UNRECORDED, NEW = 1, 2, 64, 128  # presence of an agent; the last two are added
@@ -267,77 +267,3 @@ def extent_of(settings: Mapping[str, Any]) -> float:
     """Largest coordinate that the frames of a flight can say, m."""
     value = swarm_section(settings).get("extent_m", EXTENT_M)
     return float(value) if isinstance(value, (int, float)) and 0 < value < float("inf") else EXTENT_M
-
-
-# -- making one ------------------------------------------------------------------------------------------------------
-_BLOCK = 256  # slots, of the first block of memory
-
-
-class LogBuilder:
-    """Fills a log slot by slot from agents of the core.
-
-    In each slot: :meth:`open` when all have decided and encoded their frames, :meth:`close` with the verdict.
-    """
-
-    def __init__(self, config: RunConfig) -> None:
-        self._config, swarm = config, config.swarm
-        n, steps = swarm.agents, swarm.steps
-        self.rows = 0
-        self._shapes: dict[str, tuple[tuple[int, ...], Any]] = {
-            "outcome": ((), np.uint8), "length": ((n,), np.uint8), "lost": ((n,), np.uint16),
-            "collided": ((n,), np.uint16), "chosen": ((n,), np.uint16), "reason": ((n,), np.uint8),
-            "digest": ((n,), np.uint32), "score": ((n,), np.float64), "velocity": ((3, n), np.float64),
-            "command": ((3, n), np.float64), "goal": ((3, n), np.float64), "track": ((steps, 3, n), np.float64),
-        }  # fmt: skip
-        self.arrays = {name: np.zeros((_BLOCK, *shape), kind) for name, (shape, kind) in self._shapes.items()}
-        self.frames: list[dict[int, bytes]] = []  # by sender, a slot
-        self.received: list[Mask] = []  # (F, N), a slot
-
-    def open(self, swarm: Swarm, frames: dict[int, bytes]) -> None:
-        """A slot begins: what the agents decided, and where they are.
-
-        :param frames: by the sender's id.
-        """
-        row, arrays = self.rows, self.arrays
-        if row + 1 >= len(arrays["outcome"]):
-            for name, values in arrays.items():
-                arrays[name] = np.concatenate((values, np.zeros_like(values)))
-        for name in ("chosen", "reason", "digest", "score", "velocity", "command", "goal", "track"):
-            arrays[name][row] = getattr(swarm, name)
-        if row == 0:
-            arrays["track"][0] = swarm.position  # the control instants before slot 0 have not been flown
-        for sender, data in frames.items():
-            arrays["length"][row, sender - 1] = len(data)
-        self.frames.append(frames)
-
-    def close(self, verdict: Verdict) -> None:
-        """The slot is over."""
-        row, arrays = self.rows, self.arrays
-        arrays["outcome"][row] = verdict.outcome
-        if verdict.senders:
-            columns = [sender - 1 for sender in verdict.senders]
-            order = np.argsort(columns)
-            for name, values in (("lost", verdict.lost), ("collided", verdict.collided)):
-                if values is not None:
-                    arrays[name][row, columns] = values
-            mask = verdict.mask(self._config.swarm.agents)
-            self.received.append(mask if len(columns) == 1 else mask[order])
-        else:
-            self.received.append(np.zeros((0, self._config.swarm.agents), np.bool_))
-        self.rows += 1
-
-    def fields(self, track: Floats) -> dict[str, Any]:
-        """The fields of the log, with the positions (K, 3, N) of the last slot, m."""
-        rows, swarm = self.rows, self._config.swarm
-        self.arrays["track"][rows] = track
-        kept = {name: np.ascontiguousarray(values[: rows + (name == "track")]) for name, values in self.arrays.items()}
-        shape = rows, swarm.agents
-        data = b"".join(frames[sender] for frames in self.frames for sender in sorted(frames))
-        received = np.concatenate(self.received) if self.received else np.zeros((0, swarm.agents), np.bool_)
-        fields: dict[str, Any] = {
-            "name": "", "settings": self._config.to_dict(), "agents": swarm.agents, "slot_ns": swarm.slot_ns,
-            "recorded": np.ones(rows, np.bool_), "known": np.ones(shape, np.bool_), "data": data,
-            "received": received, "offset_ns": np.zeros(shape, np.int64),
-            "start_ns": np.arange(rows) * swarm.slot_ns, **kept,
-        }  # fmt: skip
-        return fields

@@ -24,46 +24,7 @@ from dtsa_bench.runs.metrics import metrics_tables
 from dtsa_channel_sim import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .arrays import NEW, PRESENT, UNRECORDED, FlightArrays, LogBuilder
-
-Changes = Mapping[int, Mapping[str, Any]]  # of the channel's settings, by the slot from which they hold
-
-
-class ReplayedSlot(NamedTuple):
-    """A slot at its end."""
-
-    row: int  # of the log
-    swarm: Swarm  # the agents: decisions of this slot, tables as they are now
-    verdict: Verdict | None  # in lockstep: the channel's
-
-
-def replay_lockstep(
-    config: RunConfig, slots: int, changes: Changes, log: LogBuilder, hearing: Hearing
-) -> Iterator[ReplayedSlot]:
-    """All agents of a flight in lockstep and their channel, from the configuration; the log receives what happens.
-
-    Every agent keeps a table of its own, fed only by what the channel let it hear.
-    """
-    swarm = with_key(make_swarm(config.swarm, make_scenario(config.swarm)))
-    channel, ids = Channel(config.air), swarm.ids
-    for slot in range(slots):
-        if slot in changes:
-            channel.set(slot=slot, **changes[slot])
-        swarm.scenario.advance(slot, swarm)
-        frames = {ids[index]: swarm.frame(index) for index in swarm.begin(slot)}
-        log.open(swarm, frames)
-        senders = sorted(frames)
-        verdict = channel.arbitrate(slot, senders, [len(frames[sender]) for sender in senders], swarm.position)
-        log.close(verdict)
-        swarm.fly(slot)
-        mask = verdict.mask(len(ids))
-        hearing.slot(len(senders), mask)
-        for row, sender in enumerate(verdict.senders):
-            if swarm.hear(slot, frames[sender], None if verdict.received is None else mask[row].view(np.uint8)):
-                hearing.take_in(mask[row])
-        swarm.end(slot)
-        yield ReplayedSlot(slot, swarm, verdict)
-
+from .arrays import NEW, PRESENT, UNRECORDED, FlightArrays
 
 class HeardBy(NamedTuple):
     """A frame that some of the agents heard."""

@@ -20,7 +20,7 @@ from dtsa_bench.runs.config import LOCKSTEP, REALTIME
 from dtsa_bench.runs.hearing import recorded_problem
 
 from .contents import EVENTS, MERGED, BagContents
-from .lockstep import LockstepCheck
+from .lockstep import check_lockstep
 from .merged import check_merged
 from .realtime import RealtimeCheck
 from .result import Difference, Mismatch, Result
@@ -101,7 +101,7 @@ def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) ->
     elif mode == SNIFFER:
         _check_sniffed(log, result)
     elif mode == LOCKSTEP:
-        LockstepCheck(log, contents, result, progress).check()
+        check_lockstep(log, contents, result, progress)
     else:
         RealtimeCheck(log, contents, result).check()
     contents.check_odometry(log)
@@ -109,5 +109,3 @@ def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) ->
     for topic in bag.topics:
         if topic not in (SLOT_RECORD, EVENTS) and not topic.endswith("/odom"):
             result.skipped[topic] = "carries nothing that is not in other topics; covered by the digest"
-
-

@@ -83,6 +83,13 @@ class BagContents:
             raise Mismatch(Difference("slot record", "one of slot 0", f"slot {slot}", "each slot has one record", 0))
         self.records.append(record)
 
+    def changes_by_slot(self) -> dict[int, dict[str, Any]]:
+        """New values of the channel's settings, by the first slot in which they hold."""
+        found: dict[int, dict[str, Any]] = {}
+        for slot, values in self.changes:
+            found.setdefault(slot, {}).update(values)
+        return found
+
     def check_odometry(self, log: FlightArrays) -> None:
         """Whether odometry is where the records say that the agents were."""
         frames = [names.body_frame(names.agent_namespace(agent)) for agent in range(1, self._agents + 1)]
@@ -133,5 +140,3 @@ def recorded_summary(log: FlightArrays, result: Result) -> dict[str, Any]:
         result.skipped["summary.json"] = "not beside the bag"
         return {}
     return dict(json.loads(path.read_text(encoding="utf-8")))
-
-
