@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,6 +181,17 @@ class FlightArrays:
         return self.data[end - int(self.length[row, sender - 1]) : end]
 
     @cached_property
+    def heard_ends(self) -> list[int]:
+        """(S + 1) where the entries of `heard` of each slot begin, and the last ones end."""
+        rows = np.zeros(0, np.int64) if self.heard is None else self.heard.row
+        return [int(end) for end in np.searchsorted(rows, np.arange(len(self) + 1))]
+
+    @property
+    def parts(self) -> list[FlightArrays]:
+        """The slots before the first that all agents of a merged flight counted alike, if there are some, and the rest."""
+        return [self] if self.earlier is None else [self.earlier, self]
+
+    @cached_property
     def known_receivers(self) -> NDArray[np.int64]:
         """(F,) other agents of which is known whether they received a frame."""
         frames = self.sent_frames
@@ -240,6 +251,9 @@ class FlightArrays:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
+Log = TypeVar("Log", bound=FlightArrays)
+
+
 def missing_slots(recorded: Mask) -> str:
     """The slots without a record, as "slots 158 to 313"; empty: there are none."""
     edges = np.flatnonzero(np.diff(np.concatenate(([True], recorded, [True])).astype(np.int8)))
@@ -267,3 +281,50 @@ def extent_of(settings: Mapping[str, Any]) -> float:
     """Largest coordinate that the frames of a flight can say, m."""
     value = swarm_section(settings).get("extent_m", EXTENT_M)
     return float(value) if isinstance(value, (int, float)) and 0 < value < float("inf") else EXTENT_M
+
+
+def empty_arrays(slots: int, agents: int, steps: int, slot_ns: int) -> dict[str, Any]:
+    """The arrays of a log of which nothing is known yet, by their names."""
+    shape, planes = (slots, agents), (slots, 3, agents)
+    kinds = {
+        "length": np.uint8, "lost": np.uint16, "collided": np.uint16, "chosen": np.uint16, "reason": np.uint8,
+        "digest": np.uint32, "score": np.float64, "offset_ns": np.int64, "sent_ns": np.int64, "presence": np.uint8,
+        "known": np.bool_,
+    }  # fmt: skip
+    return {
+        **{name: np.zeros(shape, kind) for name, kind in kinds.items()},
+        **{name: np.full(planes, np.nan) for name in ("velocity", "command", "goal")},
+        "recorded": np.zeros(slots, np.bool_), "outcome": np.full(slots, UNKNOWN, np.uint8),
+        "start_ns": np.arange(slots) * slot_ns, "track": np.full((slots + 1, max(1, steps), 3, agents), np.nan),
+    }  # fmt: skip
+
+
+def split_log(log: Log, slot: int) -> Log:
+    """A log from a slot on; those before are kept as `earlier`.
+
+    :raises ValueError: if the slot is not in it.
+    """
+    row = slot - log.first_slot
+    if not 0 <= row <= len(log):
+        raise ValueError(f"slot {slot}, the first common one, is not in it")
+    later = _slice(log, row, len(log))
+    later.earlier = _slice(log, 0, row) if row else None
+    return later
+
+
+def _slice(log: Log, first: int, last: int) -> Log:
+    fields: dict[str, Any] = log.__getstate__()
+    for name, values in fields.items():
+        if isinstance(values, np.ndarray) and name not in ("received", "track"):
+            fields[name] = values[first:last]
+    ends = np.concatenate(([0], np.cumsum(log.length.sum(axis=1, dtype=np.int64))))
+    counts = np.concatenate(([0], np.cumsum(log.sent.sum(axis=1))))
+    fields["track"] = log.track[first : last + 1]
+    fields["data"] = log.data[int(ends[first]) : int(ends[last])]
+    fields["received"] = log.received[int(counts[first]) : int(counts[last])]
+    if log.heard is not None:
+        a, b = log.heard_ends[first], log.heard_ends[last]
+        heard = HeardFrames(*(values[a:b] for values in log.heard))
+        fields["heard"] = heard._replace(row=heard.row - first)
+    fields["first_slot"] = log.first_slot + first
+    return type(log)(**fields)

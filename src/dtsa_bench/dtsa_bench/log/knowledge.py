@@ -17,7 +17,7 @@ from dtsa_bench.runs.metrics import FlightMetrics
 
 from .ages import Ages, ObservedPairs
 from .arrays import UNKNOWN, FlightArrays, recorded_config
-from .merge.merged_flight import follow_merged, observed_merged
+from .merged_flight import follow_merged, observed_merged
 from .replay import knowledge_tables, replay_tables
 
 

@@ -8,7 +8,6 @@ import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
 from dtsa_bench.log.bag.reader import Bag, Message
 
-from .arrays import PRESENT, UNKNOWN, HeardFrames, swarm_section
+from .arrays import PRESENT, UNKNOWN, HeardFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
 
 SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
@@ -141,25 +140,10 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
     if merged is None:
         return log
     log.merged = merged
-    return split_log(log, int(merged["common_slot"]))
-
-
-def log_of_fields(
-    fields: Iterable[tuple[int, Mapping[str, Any]]],
-    name: str,
-    settings: dict[str, Any],
-    slot_ns: int,
-    merged: dict[str, Any],
-) -> FlightLog:
-    """The log of a merged flight from the fields of its records, by slot, as :func:`pack_record` takes them."""
-    records = []
-    for slot, values in fields:
-        arrays = {key: np.ascontiguousarray(values.get(key, ()), kind).ravel() for key, kind in _KINDS.items()}
-        head = {"header": _header(names.slot_time_ns(slot, slot_ns)), "slot": slot}
-        records.append(SimpleNamespace(**head, outcome=values["outcome"], steps=values["steps"], **arrays))
-    log = _Rows(records, int(settings["swarm"]["agents"]), slot_ns, False).log(name, settings)
-    log.merged = merged
-    return split_log(log, int(merged["common_slot"]))
+    try:
+        return split_log(log, int(merged["common_slot"]))
+    except ValueError as error:
+        raise UnusableBag(bag.given, str(error)) from None
 
 
 def _merged(bag: Bag) -> dict[str, Any] | None:
@@ -209,19 +193,8 @@ class _Rows:
         end = None
         if records and is_whole:  # the last one says where all are at the end, and may say no more
             end = max(records, key=lambda record: int(record.slot))
-        rows = last - self._first + (end is None)
         steps = max((int(record.steps) for record in records), default=1)
-        shape, planes = (rows, agents), (rows, 3, agents)
-        self._arrays: dict[str, Any] = {
-            "recorded": np.zeros(rows, np.bool_), "start_ns": np.arange(rows) * slot_ns, "known": np.zeros(shape, np.bool_),
-            "outcome": np.full(rows, UNKNOWN, np.uint8), "length": np.zeros(shape, np.uint8),
-            "lost": np.zeros(shape, np.uint16), "collided": np.zeros(shape, np.uint16),
-            "chosen": np.zeros(shape, np.uint16), "reason": np.zeros(shape, np.uint8),
-            "digest": np.zeros(shape, np.uint32), "score": np.zeros(shape), "offset_ns": np.zeros(shape, np.int64),
-            "sent_ns": np.zeros(shape, np.int64), "presence": np.zeros(shape, np.uint8),
-            "track": np.full((rows + 1, max(1, steps), 3, agents), np.nan),
-            **{name: np.full(planes, np.nan) for name in ("velocity", "command", "goal")},
-        }  # fmt: skip
+        self._arrays = empty_arrays(last - self._first + (end is None), agents, steps, slot_ns)
         self._frames: dict[tuple[int, int], bytes] = {}  # by row and sender
         self._received: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._heard: list[tuple[int, int, int, int, NDArray[np.bool_], bool, bytes]] = []
@@ -348,34 +321,6 @@ def cut_frames(data: NDArray[np.uint8], lengths: NDArray[np.uint8], count: int) 
     ends = np.cumsum(lengths, dtype=np.int64).tolist()
     whole = data.tobytes()
     return [whole[end - int(length) : end] for end, length in zip(ends, lengths, strict=True)]
-
-
-def split_log(log: FlightLog, slot: int) -> FlightLog:
-    """A log from a slot on; those before are kept as `earlier`."""
-    row = slot - log.first_slot
-    if not 0 <= row <= len(log):
-        raise UnusableBag(log.file or log.name, f"slot {slot}, the first common one, is not in it")
-    earlier, later = _slice(log, 0, row), _slice(log, row, len(log))
-    later.earlier = earlier if row else None
-    return later
-
-
-def _slice(log: FlightLog, first: int, last: int) -> FlightLog:
-    fields: dict[str, Any] = {name: getattr(log, name) for name in log.__dataclass_fields__}
-    for name, values in fields.items():
-        if isinstance(values, np.ndarray) and name not in ("received", "track"):
-            fields[name] = values[first:last]
-    ends = np.concatenate(([0], np.cumsum(log.length.sum(axis=1, dtype=np.int64))))
-    counts = np.concatenate(([0], np.cumsum(log.sent.sum(axis=1))))
-    fields["track"] = log.track[first : last + 1]
-    fields["data"] = log.data[int(ends[first]) : int(ends[last])]
-    fields["received"] = log.received[int(counts[first]) : int(counts[last])]
-    if log.heard is not None:
-        a, b = np.searchsorted(log.heard.row, (first, last)).tolist()
-        heard = HeardFrames(*(values[a:b] for values in log.heard))
-        fields["heard"] = heard._replace(row=heard.row - first, time_ns=heard.time_ns - first * log.slot_ns)
-    fields["first_slot"] = log.first_slot + first
-    return FlightLog(**fields)
 
 
 @lru_cache(maxsize=8)

@@ -50,6 +50,7 @@ class Sniffer:
         self._datagrams = StationSettings(config, link_of(config, port.properties), authenticator(config))
         self._slots: dict[int, dict[int, tuple[int, bytes]]] = {}  # not judged yet: by sender, when it came, and what
         self._judged = -1  # last slot
+        self._recorded_ns = 0  # when it was recorded to start
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
         self._zero_ns = time.monotonic_ns()
@@ -92,7 +93,8 @@ class Sniffer:
         frames = {sender: data for sender, (_, data) in heard.items()}
         self._judge.slot(slot, frames)
         if self.bag is not None:
-            first_ns = min(at_ns for at_ns, _ in heard.values())
+            # An old frame may have been sent again: records have their times in the order in which they are written.
+            first_ns = self._recorded_ns = max(self._recorded_ns, min(at_ns for at_ns, _ in heard.values()))
             at, nothing = first_ns - self._zero_ns + names.TIME_ZERO_NS, [0] * len(heard)
             outcome = COLLISION if len(heard) > 1 else SUCCESS
             self.bag.write(at, pack_record(

@@ -56,7 +56,8 @@ class _Channel:
 class BagWriter:
     """One bag directory being recorded. For one thread; a context manager.
 
-    :param directory: where the bag is made; must not exist, or be empty. Parents are made.
+    :param directory: where the bag is made; must not exist, or be empty. Parents are made. Or the name of an .mcap file,
+        for a bag that is this file alone.
     :param config: configuration of the run, JSON types only: stored whole in the bag, its `seed` once more
         by itself; None: the bag says nothing of its origin but `custom_data`.
     :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
@@ -83,7 +84,8 @@ class BagWriter:
         if compression not in COMPRESSIONS:
             raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
         self.directory = Path(directory)
-        if self.directory.exists() and (not self.directory.is_dir() or any(self.directory.iterdir())):
+        self._is_file = self.directory.suffix == ".mcap"
+        if not self._is_file and self.directory.exists() and (not self.directory.is_dir() or any(self.directory.iterdir())):
             raise ConfigError("directory of the bag", str(directory), "one that is empty or does not exist yet")
         self.custom_data = dict(custom_data or {})
         if config is not None:
@@ -97,7 +99,7 @@ class BagWriter:
             self.custom_data["chunks"] = "complete steps"
         self._marked, self._chunk_size, self._min_time_ns = marked, chunk_size, min_time_ns
         self._chunk_bytes = 0  # in the chunk that is being filled
-        self.path = self.directory / f"{self.directory.resolve().name}_0.mcap"
+        self.path = self.directory if self._is_file else self.directory / f"{self.directory.resolve().name}_0.mcap"
         self._channels: list[_Channel] = []  # the channel's number - 1 is its index
         self._schemas: dict[Definition, int] = {}
         self._digest = BagDigest()
@@ -106,7 +108,7 @@ class BagWriter:
         self._failure = ""
         self._closed = False
         try:
-            self.directory.mkdir(parents=True, exist_ok=True)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = self.path.open("xb")
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
@@ -250,7 +252,8 @@ class BagWriter:
             self._add_own_metadata()
             self._mcap.finish()
             self._stream.close()
-            metadata.write(self.directory, self._metadata())
+            if not self._is_file:
+                metadata.write(self.directory, self._metadata())
 
     def __enter__(self) -> BagWriter:
         return self

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from typing import Any
 
@@ -21,14 +20,14 @@ from dtsa_agent.core.frame import (
 )
 from dtsa_agent.keys import VARIABLE
 from dtsa_bench.log.arrays import FlightArrays
-from dtsa_bench.log.replay import replay_log
+from dtsa_bench.log.replay import AgentReplay
 from dtsa_bench.log.rules import Judge
 from dtsa_bench.runs.config import REALTIME, RunConfig
 from dtsa_bench.runs.hearing import Hearing
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 from .contents import BagContents, recorded_summary
-from .differences import WHY, first_difference
+from .differences import WHY, decision_difference
 from .on_air import FramesOnAir
 from .result import Difference, Mismatch, Result
 
@@ -135,19 +134,20 @@ class RealtimeCheck:
 
 
 def compare_decisions(log: FlightArrays, tags: bool) -> int:
-    """Make the decisions of agents with clocks of their own again, and return how many are equal.
+    """Replay all agents, together, up to the first slot that one of them has not told of; return the equal decisions.
 
-    :raises Mismatch: at the first that is not.
+    :param tags: check the tags of frames.
+    :raises Mismatch: at the first that is not equal.
     """
-    equal, why = 0, "follows from what the agent says to have taken in"
-    for row, swarm in replay_log(log, tags):
-        for name in ("chosen", "reason", "digest", "score"):
-            expected, recorded = getattr(swarm, name), getattr(log, name)[row]
-            if expected.tobytes() != recorded.tobytes():
-                difference = first_difference(name, expected[None], recorded[None], row, log)[1].difference
-                raise Mismatch(dataclasses.replace(difference, reason=why))
-        equal += log.agents
-    return equal
+    replay = AgentReplay(log.config.swarm, range(1, log.agents + 1), tags)
+    for row in range(len(log)):
+        if not log.known[row].all():
+            break
+        replay.step(log, row)
+        if replay.differences:
+            why = "follows from what the agent says to have taken in"
+            raise decision_difference(replay.differences[0], log, why)
+    return replay.equal
 
 
 def check_own_states(log: FlightArrays, own_states: OwnStates) -> None:

@@ -27,7 +27,7 @@ from dtsa_agent.core.station import (
     check_joinable,
 )
 from dtsa_agent.keys import authenticator
-from dtsa_bench.log.merge.joined import all_known_after
+from dtsa_bench.log.merged_flight import slots_until_all_known
 from dtsa_bench.log.rules import Judge
 from dtsa_bench.pages.html import pack
 from dtsa_bench.runs.config import REALTIME, RunConfig
@@ -64,7 +64,7 @@ class ListenedRun:
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
         self._absent = set(range(1, config.agents + 1))
         self._lost: dict[int, int] = {}  # slot since when, of agents that were heard before
-        self._quiet = all_known_after(config)  # slots, in which every agent has had a turn
+        self._quiet = slots_until_all_known(config)  # slots, in which every agent has had a turn
         self._late_ns: deque[int] = deque(maxlen=_LATENESS)
         self._period = max(1, round(_PERIOD_NS / config.slot_ns))  # slots from one moment to the next
         self._no_choice = np.zeros(config.agents, np.uint16)  # only the agents know whom they choose
