@@ -155,24 +155,26 @@ class FramesOnAir:
             raise Mismatch(Difference("received", f"without cf{one.sender}", _ids(other.received),
                                       "who sends does not hear", other.slot, other.sender))  # fmt: skip
 
-    def check_verdicts(self, changes: Sequence[tuple[int, dict[str, Any]]]) -> int:
+    def check_verdicts(self, changes: Sequence[tuple[int, dict[str, Any]]], until_ns: int | None = None) -> int:
         """Make all verdicts again from the frames, their times and the channel's seed; returns how many.
 
         :param changes: first slot and values of each change of the channel's settings.
+        :param until_ns: only those on frames that have left the air by then; None: all.
         :raises Mismatch: at the first that is not equal.
         """
         channel = Channel(self.config)
         for slot, values in changes:
             channel.set(slot=slot, **values)
         again = self._on_one_time_line(channel) if self.own_clocks else self._by_slots(channel)
-        for key in sorted(again):
+        keys = [key for key in again if until_ns is None or self._sent[key].on_air.end_ns <= until_ns]
+        for key in sorted(keys):
             sent = self._sent[key]
             for name, one, other in zip(("received", "lost", "collided"), again[key], sent.verdict, strict=True):
                 expected, recorded = (_ids(one), _ids(other)) if name == "received" else (str(one), str(other))
                 if expected != recorded:
                     why = "overlap on the time line, and the channel's draw from its seed"
                     raise Mismatch(Difference(name, expected, recorded, why, sent.slot, sent.sender))
-        return len(again)
+        return len(keys)
 
     def _on_one_time_line(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
         settled = self._settled(channel)
