@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.records import Channel, Message, Metadata, Schema
-from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.air.datagram import flight_ns, frame_in
 from dtsa_agent.air.port import PortProperties, PortSettings
@@ -34,6 +33,7 @@ from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_bench.log.arrays import NEW
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, register_type
 from dtsa_bench.log.bag.recover import RecordScan
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
 from dtsa_bench.log.record import (
@@ -45,7 +45,6 @@ from dtsa_bench.log.record import (
     cut_frames,
     frame_fields,
     pack_record,
-    record_codec,
 )
 from dtsa_bench.runs.config import REALTIME
 from dtsa_bench.runs.options import new_directory
@@ -58,7 +57,6 @@ SUMMARY = "summary"  # name in custom data
 _CHUNK = 1 << 18  # bytes
 _AT_A_TIME = 8  # slots: several at a time take half as long
 _NAME = re.compile(r"cf\d+\.mcap")
-_DAMAGE = (SerdeError, AssertionError, IndexError, KeyError, ValueError, struct.error)  # of a message that is none
 
 
 @dataclass(slots=True)
@@ -270,30 +268,33 @@ class _Reader:
         self._file = file
         self.bag: AgentBag | None = None
         self._channel = 0  # of the slot records
-        self._unpack: Callable[[bytes], Any] | None = None
+        self._store = get_typestore(Stores.EMPTY)
         self._custom: dict[str, str] = {}
         self._digest = BagDigest()
 
     def add(self, record: Any) -> bool:
         """Add a record of the file; return whether it can be used: what follows one that cannot is left out."""
+        try:
+            self._add(record)
+        except UnusableBag:
+            raise
+        except NOT_OF_ITS_TYPE:
+            return False
+        return True
+
+    def _add(self, record: Any) -> None:
         if isinstance(record, Channel) and record.topic == SLOT_RECORD:
             self._channel = record.id
         elif isinstance(record, Schema) and record.name == TYPE:
-            self._unpack = record_codec(record.data.decode())
+            register_type(self._store, TYPE, record.data.decode())
         elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
             custom = metadata.custom_data(metadata.load_record(record))
             self._custom |= custom if AGENT in custom else {}
             self.bag = self.bag or (_make_bag(self._file, custom) if AGENT in custom else None)
-        elif isinstance(record, Message) and record.channel_id == self._channel and self.bag and self._unpack:
+        elif isinstance(record, Message) and record.channel_id == self._channel and self.bag:
             times = record.log_time, record.publish_time, record.sequence
             self._digest.add(SLOT_RECORD.encode(), *times, record.data, True)
-            try:
-                _add_slot(self.bag, self._unpack(record.data))
-            except UnusableBag:
-                raise
-            except _DAMAGE:
-                return False
-        return True
+            _add_slot(self.bag, self._store.deserialize_cdr(record.data, TYPE))
 
     def finish(self, is_finished: bool) -> AgentBag:
         """The bag, when all that is whole has been added."""

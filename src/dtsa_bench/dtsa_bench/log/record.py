@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, lru_cache
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.base import TypesysError
+from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.packing import pack_received, unpack_received
 from dtsa_bench.log.bag import schema
-from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
-from dtsa_bench.log.bag.reader import Bag, Message
+from dtsa_bench.log.bag.reader import Bag, register_type
 
 from .arrays import PRESENT, UNKNOWN, HeardFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
@@ -46,8 +43,7 @@ _DECIDED = ("chosen", "reason", "digest", "score")
 def _store() -> Any:
     store = get_typestore(Stores.EMPTY)
     for kind in (TYPE, CONFIGURATION):
-        found = get_types_from_msg(schema.installed(kind).text, kind)
-        store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
+        register_type(store, kind, schema.installed(kind).text)
     return store
 
 
@@ -99,8 +95,7 @@ def load_log(source: Bag | str | Path) -> FlightLog:
         with Bag(source) as bag:
             return load_log(bag)
     check_format(source)
-    decode = record_decoder(source)
-    return build_log(source, (decode(message) for message in source.messages([SLOT_RECORD])))
+    return build_log(source, (record for _, record in source.typed([SLOT_RECORD])))
 
 
 def check_format(bag: Bag) -> None:
@@ -321,33 +316,3 @@ def cut_frames(data: NDArray[np.uint8], lengths: NDArray[np.uint8], count: int) 
     ends = np.cumsum(lengths, dtype=np.int64).tolist()
     whole = data.tobytes()
     return [whole[end - int(length) : end] for end, length in zip(ends, lengths, strict=True)]
-
-
-@lru_cache(maxsize=8)
-def record_codec(definition: str) -> Callable[[bytes], Any]:
-    """What makes a SlotRecord of CDR, by the definition that stands beside it.
-
-    :raises UnusableBag: for a definition that is none.
-    """
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register(get_types_from_msg(definition, TYPE))
-    except (TypesysError, SyntaxError) as error:
-        raise UnusableBag(SLOT_RECORD, f"the definition of {TYPE} cannot be used: {error}") from None
-    return lambda data: store.deserialize_cdr(data, TYPE)
-
-
-def record_decoder(bag: Bag) -> Callable[[Message], Any]:
-    """What decodes the records of a bag; it raises BagError for what is none."""
-    topic = bag.topics.get(SLOT_RECORD)
-    if topic is None or topic.type != TYPE:
-        return bag.decode
-    unpack = record_codec(topic.definition)
-
-    def decode(message: Message) -> Any:
-        try:
-            return unpack(message.data)
-        except (SerdeError, AssertionError, IndexError, KeyError, ValueError, struct.error) as error:
-            raise BagError(f"{SLOT_RECORD} at {message.log_time_ns} ns: not a valid {TYPE} ({error})") from None
-
-    return decode

@@ -35,7 +35,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import PROFILES, load_profiles
-from dtsa_bench.log.bag.reader import Bag, Message
+from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.replay import Player, ros_profile
 from dtsa_bench.log.bag.writer import BagWriter
 

@@ -12,9 +12,9 @@ from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.cdr import OdometryPacker
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import RUN_ID
-from dtsa_bench.log.bag.reader import Bag, Message
+from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest
-from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, record_decoder
+from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER
 
 from .result import Difference, Mismatch, Result
 
@@ -32,7 +32,7 @@ class BagContents:
 
     def __init__(self, bag: Bag, slot_ns: int, agents: int, result: Result) -> None:
         self._slot_ns, self._agents, self._result = slot_ns, agents, result
-        self._decode = record_decoder(bag)
+        self._decode = bag.decode
         self.records: list[Any] = []
         self.changes: list[tuple[int, dict[str, Any]]] = []  # slot, values
         self._odometry: list[tuple[int, int, bytes]] = []  # slot, agent, message
@@ -68,7 +68,7 @@ class BagContents:
                 agent = message.topic.split("/")[1][2:]
                 self._odometry.append((slot, int(agent) if agent.isdigit() else 0, message.data))
 
-    def _add_record(self, message: Message, run: int) -> None:
+    def _add_record(self, message: BagMessage, run: int) -> None:
         record = self._decode(message)
         slot, stamp = int(record.slot), record.header.stamp
         right = message.log_time_ns if self._partial else names.slot_time_ns(slot, self._slot_ns)
