@@ -37,7 +37,7 @@ class SentFrames(NamedTuple):
     collided: NDArray[np.int64]  # receivers at which it collided
 
 
-class HeardFrames(NamedTuple):
+class ReceivedFrames(NamedTuple):
     """Frames that agents with clocks of their own took in, in this order; arrays have one row an entry (H)."""
 
     row: NDArray[np.int64]  # in whose slot they were taken in
@@ -81,7 +81,7 @@ class FlightArrays:
     goal: Floats  # (S, 3, N) m
     sent_ns: NDArray[np.int64] | None = None  # (S, N) ns, with clocks of their own: start of transmissions, likewise
     presence: NDArray[np.uint8] | None = None  # (S, N) PRESENT or LEAVING, UNRECORDED or NEW added; None: all PRESENT
-    heard: HeardFrames | None = None  # in flights of agents with clocks of their own
+    heard: ReceivedFrames | None = None  # in flights of agents with clocks of their own
     first_slot: int = 0  # number that the agents gave slot 0
     merged: dict[str, Any] | None = None  # what the log was merged from; None: it was recorded as one
     earlier: FlightArrays | None = None  # of a merged one: slots before the first that all counted alike
@@ -324,7 +324,7 @@ def _slice(log: Log, first: int, last: int) -> Log:
     fields["received"] = log.received[int(counts[first]) : int(counts[last])]
     if log.heard is not None:
         a, b = log.heard_ends[first], log.heard_ends[last]
-        heard = HeardFrames(*(values[a:b] for values in log.heard))
+        heard = ReceivedFrames(*(values[a:b] for values in log.heard))
         fields["heard"] = heard._replace(row=heard.row - first)
     fields["first_slot"] = log.first_slot + first
     return type(log)(**fields)

@@ -17,7 +17,7 @@ from dtsa_bench.runs.summary_text import result_rows, setting_rows, what_came_of
 from dtsa_bench.simulation.simulate import SimulatedFlight
 from dtsa_bench.simulation.slot_arrays import SlotWriter
 
-from .arrays import FlightArrays, HeardFrames
+from .arrays import FlightArrays, ReceivedFrames
 
 if TYPE_CHECKING:
     from typing import Any
@@ -177,8 +177,8 @@ def log_of_flight(flight: SimulatedFlight) -> FlightLog:
     )  # fmt: skip
 
 
-def _heard_frames(flight: SimulatedFlight, agents: int) -> HeardFrames:
+def _heard_frames(flight: SimulatedFlight, agents: int) -> ReceivedFrames:
     frames = flight.accepted or []
     row, slot = (np.array([getattr(frame, name) for frame in frames], np.int64) for name in ("row", "slot"))
     by, none = np.array([frame.by for frame in frames], np.bool_).reshape(len(frames), agents), np.zeros_like(row)
-    return HeardFrames(row, none, slot, none, by, none.astype(np.bool_), [frame.data for frame in frames])
+    return ReceivedFrames(row, none, slot, none, by, none.astype(np.bool_), [frame.data for frame in frames])

@@ -17,11 +17,10 @@ from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_channel_sim import ChannelConfig
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
-from .ages import Ages, ObservedPairs
 from .arrays import FlightArrays
 from .bag.errors import UnusableBag
-from .replay import AgentReplay
-from .rules import Judge
+from .replay import AgentReplay, MeanAges, ObservedPairs
+from .rules import RuleChecker
 
 _FOREVER_S = 86_400.0
 _GAP_SLOTS = 50  # an agent that says nothing for longer has fallen out
@@ -276,18 +275,18 @@ def _results(metrics: FlightMetrics, first: int) -> dict[str, Any]:
 
 
 # -- what the log must hold ------------------------------------------------------------------------------------------
-def check_rules(log: FlightArrays, unsent: Mapping[tuple[int, int], bytes]) -> Judge:
+def check_rules(log: FlightArrays, unsent: Mapping[tuple[int, int], bytes]) -> RuleChecker:
     """Whether the frames that were sent, or heard, keep to the rules, from when on all counted alike.
 
     :param unsent: frames that were made and not sent, by slot and agent.
     """
-    judge, by_slot = Judge(log.config.swarm), dict[int, dict[int, bytes]]()
+    judge, by_slot = RuleChecker(log.config.swarm), dict[int, dict[int, bytes]]()
     for (slot, agent), data in unsent.items():
         by_slot.setdefault(slot, {})[agent] = data
     for row in range(len(log)):
         slot, senders = log.first_slot + row, np.flatnonzero(log.length[row]).tolist()
         if senders or slot in by_slot:
-            judge.slot(slot, {sender + 1: log.frame(row, sender + 1) for sender in senders}, by_slot.get(slot))
+            judge.check_slot(slot, {sender + 1: log.frame(row, sender + 1) for sender in senders}, by_slot.get(slot))
     return judge
 
 
@@ -322,13 +321,13 @@ def _recorded_frames(log: FlightArrays) -> Iterator[tuple[tuple[int, int], bytes
 
 
 # -- what the agents knew --------------------------------------------------------------------------------------------
-def follow_merged(log: FlightArrays) -> tuple[Ages, dict[str, Any], list[str]]:
+def follow_merged(log: FlightArrays) -> tuple[MeanAges, dict[str, Any], list[str]]:
     """What the agents of a merged flight knew, and its results, by replaying all of them."""
-    ages, replay = Ages.empty(len(log), log.agents), MergedReplay(log)
+    ages, replay = MeanAges.empty(len(log), log.agents), MergedReplay(log)
     for slot in replay:
         counted, age, error = slot.pairs()
         ages.results[slot.row] = slot.results
-        ages.put(slot.row, counted & slot.counted, age, error)
+        ages.set_means(slot.row, counted & slot.counted, age, error)
     return ages, replay.results or {}, _notes(log.merged or {}, np.flatnonzero(ages.results))
 
 

@@ -20,7 +20,7 @@ from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
 from dtsa_bench.log.bag.reader import Bag, register_type
 
-from .arrays import PRESENT, UNKNOWN, HeardFrames, empty_arrays, split_log, swarm_section
+from .arrays import PRESENT, UNKNOWN, ReceivedFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
 
 SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
@@ -298,7 +298,7 @@ class _Rows:
             first_slot=self._first, has_end=self.has_end, **arrays,
         )  # fmt: skip
 
-    def _heard_frames(self) -> HeardFrames:
+    def _heard_frames(self) -> ReceivedFrames:
         frames = [
             data or self._frames.get((slot - self._first, sender), b"")
             for _, sender, slot, _, _, _, data in self._heard
@@ -306,7 +306,7 @@ class _Rows:
         columns = list(zip(*self._heard, strict=True)) if self._heard else [()] * 7
         numbers = [np.array(column, np.int64) for column in columns[:4]]
         by = np.array(columns[4], np.bool_).reshape(len(frames), self.agents)
-        return HeardFrames(*numbers, by, np.array(columns[5], np.bool_), frames)
+        return ReceivedFrames(*numbers, by, np.array(columns[5], np.bool_), frames)
 
 
 def cut_frames(data: NDArray[np.uint8], lengths: NDArray[np.uint8], count: int) -> list[bytes]:

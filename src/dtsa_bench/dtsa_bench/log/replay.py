@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from dtsa_agent.core.errors import RemoteProtocolError
 from dtsa_agent.core.frame import TAG_LENGTH, decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
-from dtsa_bench.runs.hearing import Hearing
+from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import metrics_tables
 
 from .arrays import NEW, PRESENT, UNRECORDED, FlightArrays
@@ -133,10 +134,10 @@ def knowledge_tables(log: FlightArrays) -> Swarm:
     return metrics_tables(config, scenario, everyone=not shared)
 
 
-def replay_tables(log: FlightArrays, tables: Swarm, hearing: Hearing | None = None) -> Iterator[int]:
+def replay_tables(log: FlightArrays, tables: Swarm, delivery: DeliveryCounts | None = None) -> Iterator[int]:
     """Feed what the agents received to their tables; yields each row at its end.
 
-    :param hearing: counts what was sent, arrived, and was taken in.
+    :param delivery: counts what was sent, arrived, and was taken in.
     """
     frames = log.sent_frames
     starts = np.searchsorted(frames.row, np.arange(len(log) + 1)).tolist()
@@ -145,19 +146,55 @@ def replay_tables(log: FlightArrays, tables: Swarm, hearing: Hearing | None = No
     assert scenario is not None
     for row in range(len(log)):
         scenario.advance(row, tables)
-        if hearing is not None:
-            hearing.slot(starts[row + 1] - starts[row], frames.received[starts[row] : starts[row + 1]])
+        if delivery is not None:
+            delivery.add_slot(starts[row + 1] - starts[row], frames.received[starts[row] : starts[row + 1]])
         if log.heard is not None:
             for k in range(log.heard_ends[row], log.heard_ends[row + 1]):
-                if tables.hear(int(log.heard.slot[k]), log.heard.data[k], log.heard.by[k].astype(np.uint8)) and hearing:
-                    hearing.take_in(log.heard.by[k])
+                if tables.hear(int(log.heard.slot[k]), log.heard.data[k], log.heard.by[k].astype(np.uint8)) and delivery:
+                    delivery.add_accepted(log.heard.by[k])
         else:
             for k in range(starts[row], starts[row + 1]):
                 mask = None
                 if not shared:
                     mask = frames.received[k].astype(np.uint8)
                     mask[frames.sender[k] - 1] = 1  # who sends knows what it said
-                if tables.hear(row, frames.data[k], mask) and hearing is not None:
-                    hearing.take_in(frames.received[k])
+                if tables.hear(row, frames.data[k], mask) and delivery is not None:
+                    delivery.add_accepted(frames.received[k])
         tables.end(row)
         yield row
+
+
+# -- ages and errors --------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class MeanAges:
+    """By slot and agent: means over all observers that still have that agent in A_p; NaN without any."""
+
+    age: NDArray[np.float64]  # slots, (S, N)
+    error: NDArray[np.float64]  # m, (S, N)
+    observers: NDArray[np.int64]  # (S, N)
+    results: NDArray[np.bool_]  # (S,) slots that the means of a flight take
+
+    @classmethod
+    def empty(cls, slots: int, agents: int) -> MeanAges:
+        """Without an observer in any slot."""
+        shape = slots, agents
+        return cls(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.int64), np.zeros(slots, np.bool_))
+
+    def set_means(self, slot: int, counted: NDArray[Any], age: NDArray[Any], error: NDArray[Any]) -> None:
+        """Set the means of a slot from pairs of observers and agents: who counts, ages and errors, (V, N)."""
+        observers = self.observers[slot] = counted.sum(axis=0)
+        some = observers > 0
+        for mean, values in ((self.age, age), (self.error, error)):
+            mean[slot, some] = np.where(counted, values, 0).sum(axis=0)[some] / observers[some]
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedPairs:
+    """What each observer knew of each other agent that it had heard, at the end of one slot: P pairs."""
+
+    slot: int
+    observer: NDArray[np.int64]  # (P,) ids
+    agent: NDArray[np.int64]  # (P,) ids
+    age: NDArray[np.int64]  # slots, (P,)
+    error: NDArray[np.float64]  # m, (P,)
+    counted: NDArray[np.bool_]  # (P,) the observer still has it in A_p, and it moves

@@ -28,7 +28,7 @@ _MOST_LISTENS = 10_000  # for one frame
 
 
 @dataclass(slots=True)
-class Carried:
+class SlotTraffic:
     """What the air carried in one slot."""
 
     senders: tuple[int, ...] = ()  # ids that began to send a frame in it, each once
@@ -48,7 +48,7 @@ class _Packet(NamedTuple):
     to: int = 0  # id of the one agent that takes the frame in; 0: all
 
 
-class Radios:
+class ListeningRadios:
     """Radios that listen before they send: each holds one frame until its policy's ``sensed`` says that it may begin.
 
     The medium says whether the air is in use where a radio is: range, hidden senders, the turn-round to sending.
@@ -128,7 +128,7 @@ class UnslottedTraffic:
         self._airtime = channel.config.airtime
         self._air: Air[int] = Air(channel)
         row = swarm.config.policy_row
-        self._radios = Radios(self._air, swarm.policies) if row.listens else None
+        self._radios = ListeningRadios(self._air, swarm.policies) if row.listens else None
         self._reacts = row.reacts
         self._wakes = [(0, index) for index in range(len(swarm.ids))]
         heapify(self._wakes)
@@ -138,16 +138,16 @@ class UnslottedTraffic:
         self._on_air: dict[int, _Packet] = {}
         self._arriving: list[tuple[int, int, _Packet, NDArray[np.bool_]]] = []  # heap by arrival
         self._frames: list[bytes] = []
-        self._carried = Carried()
+        self._carried = SlotTraffic()
         self._began: set[int] = set()
 
-    def slot(self, slot: int) -> Carried:
+    def slot(self, slot: int) -> SlotTraffic:
         """Everything that happens on the air in a slot; tables are as they were when it began.
 
         :param slot: its number; slots come one after the other.
         """
         swarm, end_ns = self._swarm, (slot + 1) * self._slot_ns
-        self._carried, self._began = Carried(), set()
+        self._carried, self._began = SlotTraffic(), set()
         swarm.sends[:] = swarm.present > 0
         swarm.emit(slot)
         self._frames = [swarm.frame(index) for index in range(len(swarm.ids))]

@@ -47,12 +47,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
 
 class Listener:
     def __init__(self) -> None:
-        self.messages: list[Message] = []
+        self.messages: list[BagMessage] = []
         self.walls: list[int] = []
         self.clocks: list[int] = []
         self.clock_walls: list[int] = []
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: BagMessage) -> None:
         self.messages.append(message)
         self.walls.append(time.monotonic_ns())
 

@@ -90,11 +90,9 @@ class BagWriter:
         self.custom_data = dict(custom_data or {})
         if config is not None:
             self.custom_data |= {
-                "project": "dtsa",
-                "version": __version__,
+                "project": "dtsa", "version": __version__, "configuration": json.dumps(config, sort_keys=True),
                 "seed": str({**config, **config.get("swarm", {})}.get("seed", "")),
-                "configuration": json.dumps(config, sort_keys=True),
-            }
+            }  # fmt: skip
         if marked:
             self.custom_data["chunks"] = "complete steps"
         self._marked, self._chunk_size, self._min_time_ns = marked, chunk_size, min_time_ns
@@ -197,10 +195,7 @@ class BagWriter:
             self._fail(error)
         self._digest.add(target.key, log_time_ns, publish_time_ns, sequence, data, target.has_run)
         target.count += 1
-        if log_time_ns < self._start_ns:
-            self._start_ns = log_time_ns
-        if log_time_ns > self._end_ns:
-            self._end_ns = log_time_ns
+        self._start_ns, self._end_ns = min(self._start_ns, log_time_ns), max(self._end_ns, log_time_ns)
         if self._marked:
             self._chunk_bytes += len(data) + _RECORD_BYTES
         elif monotonic() >= self._next_flush:
@@ -265,44 +260,32 @@ class BagWriter:
         """What `metadata.yaml` says below its root."""
         start_ns, end_ns = self.time_range_ns
         extent = {
-            "starting_time": {"nanoseconds_since_epoch": start_ns},
-            "duration": {"nanoseconds": end_ns - start_ns},
+            "starting_time": {"nanoseconds_since_epoch": start_ns}, "duration": {"nanoseconds": end_ns - start_ns},
             "message_count": self.message_count,
-        }
+        }  # fmt: skip
         topics = [
             {
                 "topic_metadata": {
-                    "name": channel.topic,
-                    "type": channel.definition.name,
+                    "name": channel.topic, "type": channel.definition.name,
                     "serialization_format": channel.definition.message_encoding,
-                    "offered_qos_profiles": channel.profiles,
-                    "type_description_hash": channel.definition.type_hash,
+                    "offered_qos_profiles": channel.profiles, "type_description_hash": channel.definition.type_hash,
                 },
                 "message_count": channel.count,
             }
             for channel in self._channels
-        ]
+        ]  # fmt: skip
         return {
-            "version": metadata.VERSION,
-            "storage_identifier": "mcap",
-            **extent,
-            "topics_with_message_count": topics,
-            "compression_format": "",
-            "compression_mode": "",
-            "relative_file_paths": [self.path.name],
-            "files": [{"path": self.path.name, **extent}],
-            "custom_data": self.custom_data,
-            "ros_distro": "jazzy",
-        }
+            "version": metadata.VERSION, "storage_identifier": "mcap", **extent, "topics_with_message_count": topics,
+            "compression_format": "", "compression_mode": "", "relative_file_paths": [self.path.name],
+            "files": [{"path": self.path.name, **extent}], "custom_data": self.custom_data, "ros_distro": "jazzy",
+        }  # fmt: skip
 
     def _add_own_metadata(self) -> None:
         self._mcap.add_metadata(metadata.RECORD_NAME, {metadata.RECORD_KEY: metadata.dump(self._metadata())})
 
     def _check_open(self) -> None:
-        if self._failure:
-            raise BagError(self._failure)
-        if self._closed:
-            raise BagError(f"the bag {self.directory} is closed: nothing more can be recorded to it")
+        if self._failure or self._closed:
+            raise BagError(self._failure or f"the bag {self.directory} is closed: nothing more can be recorded to it")
 
     @contextmanager
     def _failing(self) -> Iterator[None]:

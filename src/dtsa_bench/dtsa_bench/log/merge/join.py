@@ -12,7 +12,7 @@ from dtsa_agent.air.datagram import frame_in
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.log.agent_bag import AgentBag
-from dtsa_bench.log.arrays import NEW, UNKNOWN, FlightArrays, HeardFrames, empty_arrays, split_log
+from dtsa_bench.log.arrays import NEW, UNKNOWN, FlightArrays, ReceivedFrames, empty_arrays, split_log
 from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.merged_flight import run_of
@@ -95,13 +95,13 @@ def _add_account(
     return own_ns
 
 
-def _heard_frames(heard: list[tuple[int, int, Heard, int, bool]], config: SwarmConfig) -> HeardFrames:
+def _heard_frames(heard: list[tuple[int, int, Heard, int, bool]], config: SwarmConfig) -> ReceivedFrames:
     by = np.zeros((len(heard), config.agents), np.bool_)
     by[np.arange(len(heard)), np.array([column for _, column, *_ in heard], np.intp)] = True
     numbers = [(row, one.sender, one.slot, at_ns) for row, _, one, at_ns, _ in heard]
     columns = np.array(numbers, np.int64).reshape(-1, 4).T
     data = [frame_in(one.datagram, config) for _, _, one, *_ in heard]
-    return HeardFrames(*columns, by, np.array([early for *_, early in heard], np.bool_), data)
+    return ReceivedFrames(*columns, by, np.array([early for *_, early in heard], np.bool_), data)
 
 
 def _describe(process: Process, bag: AgentBag) -> dict[str, Any]:

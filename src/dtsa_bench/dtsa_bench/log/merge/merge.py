@@ -17,8 +17,8 @@ from dtsa_bench.log.agent_bag import AgentBag
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.merged_flight import MergedReplay, check_rules
-from dtsa_bench.log.rules import Judge
-from dtsa_bench.runs.hearing import of_datagrams
+from dtsa_bench.log.rules import RuleChecker
+from dtsa_bench.runs.delivery import counts_of_datagrams
 
 from .join import join
 from .timeline import Clock, Crossing, Process, TimeLine, fit, process_name
@@ -114,9 +114,9 @@ class Merge:
         refused: Counter[str] = sum((bag.refused for bag in processes.values()), Counter())
         slots, here = max(len(bag.slots) for bag in processes.values()), {agent for agent, _ in processes}
         heard = sum(len(record.before) + len(record.heard) for bag in processes.values() for record in bag.slots)
-        hearing = of_datagrams(len(here), slots, len(self.sent), heard, refused)
+        delivery = counts_of_datagrams(len(here), slots, len(self.sent), heard, refused)
         held = {process_name(process): bag.summary.get("held_slots") for process, bag in processes.items()}
-        rules = check_rules(self.log, joined.unsent) if joined else Judge(self.config)
+        rules = check_rules(self.log, joined.unsent) if joined else RuleChecker(self.config)
         return {
             "bags": sum(number >= 0 for _, number in processes),
             "slots_of_times_given_up": sum(len(bag.slots) for (_, number), bag in processes.items() if number < 0),
@@ -125,7 +125,7 @@ class Merge:
             **self._starts.summary(),
             **_air(self.sent, line, air_ns, self._starts.common_slot),
             "frames_unsent": sum(len(replay.unsent) for replay in replays),
-            "unheard": hearing.problem(refused) or None,
+            "unheard": delivery.problem(refused) or None,
             "frames_heard": len(self._crossings),
             "frames_heard_not_as_sent": self.unmatched,
             "turns": rules.summary(),

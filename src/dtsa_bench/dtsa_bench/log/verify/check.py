@@ -15,9 +15,9 @@ from dtsa_bench.log.bag.writer import BROKEN_OFF
 from dtsa_bench.log.agent_bag import find_bags
 from dtsa_bench.log.merged_bag import merge_bags
 from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, build_log, check_format
-from dtsa_bench.log.rules import Judge
+from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.config import LOCKSTEP, REALTIME
-from dtsa_bench.runs.hearing import recorded_problem
+from dtsa_bench.runs.delivery import recorded_problem
 
 from .contents import EVENTS, MERGED, BagContents
 from .lockstep import check_lockstep
@@ -75,14 +75,14 @@ def _verify_agents(bags: Sequence[Path], result: Result) -> None:
 
 def _check_sniffed(log: FlightArrays, result: Result) -> None:
     """What a listener heard: frames tell of themselves whether they keep to the rules."""
-    judge, slots = Judge(log.config.swarm), log.sent_frames
+    judge, slots = RuleChecker(log.config.swarm), log.sent_frames
     frames: dict[int, dict[int, bytes]] = {}
     for row, sender, data in zip(slots.row.tolist(), slots.sender.tolist(), slots.data, strict=True):
         frames.setdefault(row + log.first_slot, {})[sender] = data
     for slot in sorted(frames):
-        judge.slot(slot, frames[slot])
+        judge.check_slot(slot, frames[slot])
     result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
-    result.take_judgement(judge)
+    result.note_rules(judge)
     result.skipped["decisions"] = "a listener does not know them"
 
 

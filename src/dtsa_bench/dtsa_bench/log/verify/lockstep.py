@@ -12,8 +12,8 @@ from dtsa_agent.core.station import check_slotted
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.flight_log import log_of_flight
-from dtsa_bench.log.rules import Judge
-from dtsa_bench.runs.hearing import Hearing
+from dtsa_bench.log.rules import RuleChecker
+from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import FlightMetrics, may_share
 from dtsa_bench.simulation.simulate import simulate
 
@@ -53,7 +53,7 @@ def check_lockstep(
         raise difference
     _check_summary(log, result, flight.metrics)
     delivered = int(log.received.sum())
-    result.unheard = Hearing(log.agents, slots, int(log.sent.sum()), delivered, delivered).problem()
+    result.unheard = DeliveryCounts(log.agents, slots, int(log.sent.sum()), delivered, delivered).problem()
     _check_safety(expected, result, flight.metrics, lossless=may_share(run) and not changes)
 
 
@@ -97,10 +97,10 @@ def _check_summary(log: FlightArrays, result: Result, metrics: FlightMetrics) ->
 
 
 def _check_safety(log: FlightArrays, result: Result, metrics: FlightMetrics, lossless: bool) -> None:
-    judge, closest = Judge(log.config.swarm), metrics.closest()
+    judge, closest = RuleChecker(log.config.swarm), metrics.closest()
     for row in range(len(log)):
         senders = np.flatnonzero(log.length[row]).tolist()
-        judge.slot(row, {sender + 1: log.frame(row, sender + 1) for sender in senders})
+        judge.check_slot(row, {sender + 1: log.frame(row, sender + 1) for sender in senders})
     crowded, agreement = int((log.sent.sum(axis=1) > 1).sum()), bool((log.chosen == log.chosen[:, :1]).all())
     result.safety = {
         "slots_with_two_senders": crowded,
@@ -109,7 +109,7 @@ def _check_safety(log: FlightArrays, result: Result, metrics: FlightMetrics, los
         "closest_pair": list(closest[1]),
         "crashed": metrics.crash_slot >= 0,
     }
-    result.take_judgement(judge)
+    result.note_rules(judge)
     if lossless and (crowded or not agreement):
         why = "without loss all agents hear the same and choose the same"
         raise Mismatch(Difference("two senders in one slot", "never", f"{crowded} slots", why))

@@ -51,7 +51,7 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     result.skipped["why a frame was not heard"] = "a network does not say"
     result.safety |= {
         "frames": rules.frames,
-        "slots_with_two_senders": rules.double,
+        "slots_with_two_senders": rules.double_slots,
         "missing": about["missing"],
         "broken_off_bags": about["broken_off"],
     }

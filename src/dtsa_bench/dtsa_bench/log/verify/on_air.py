@@ -14,7 +14,7 @@ from dtsa_agent.core.agents.delays import Delays
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
 
-from dtsa_bench.log.arrays import FlightArrays, HeardFrames
+from dtsa_bench.log.arrays import FlightArrays, ReceivedFrames
 from .result import Difference, Mismatch
 
 Mask = NDArray[np.bool_]
@@ -210,7 +210,7 @@ class FramesOnAir:
         """A frame; None if it was not sent."""
         return self._sent.get((slot, sender))
 
-    def check_heard(self, heard: HeardFrames, slots: int) -> tuple[int, dict[str, Any]]:
+    def check_heard(self, heard: ReceivedFrames, slots: int) -> tuple[int, dict[str, Any]]:
         """Whether agents took in what was delivered to them, once, and not before it was.
 
         :param slots: how many the log has.

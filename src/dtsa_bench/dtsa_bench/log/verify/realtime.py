@@ -21,9 +21,9 @@ from dtsa_agent.core.frame import (
 from dtsa_agent.keys import VARIABLE
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.replay import AgentReplay
-from dtsa_bench.log.rules import Judge
+from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.config import REALTIME, RunConfig
-from dtsa_bench.runs.hearing import Hearing
+from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 from .contents import BagContents, recorded_summary
@@ -73,7 +73,7 @@ class RealtimeCheck:
             result.skipped["decisions and motion"] = (
                 "they depend on when each message reached each process, which the bag does not hold"
             )
-        self._judge()
+        self._check_rules()
         result.safety |= self.frames.safety()
         if self._own_clocks:
             self._note_spread()
@@ -92,10 +92,10 @@ class RealtimeCheck:
         assert log.heard is not None
         count, delays = self.frames.check_heard(log.heard, len(log))
         result.count("frames taken in as they were delivered", count)
-        hearing = Hearing(log.agents)
-        hearing.slots, hearing.sent = len(log), int(log.sent.sum())
-        hearing.delivered, hearing.taken_in = int(log.received.sum()), count
-        result.unheard = hearing.problem(summary.get("not_taken_in"))
+        delivery = DeliveryCounts(log.agents)
+        delivery.slots, delivery.sent = len(log), int(log.sent.sum())
+        delivery.delivered, delivery.accepted = int(log.received.sum()), count
+        result.unheard = delivery.problem(summary.get("not_taken_in"))
         result.skipped["motion"] = "it depends on when in a slot each message reached each process"
         if self.run.swarm.auth and not own_states.has_key:
             result.skipped["decisions"] = f"no key in {VARIABLE}"
@@ -103,9 +103,9 @@ class RealtimeCheck:
             result.count("decisions made again", compare_decisions(log, self.run.swarm.auth))
         result.safety |= delays | {"stalls": summary.get("stalls", [])}
 
-    def _judge(self) -> None:
+    def _check_rules(self) -> None:
         """Whether the frames keep to the rules; those that came too late to be sent were made all the same."""
-        log, judge = self._log, Judge(self.run.swarm)
+        log, judge = self._log, RuleChecker(self.run.swarm)
         ids = np.arange(1, log.agents + 1)
         unsent = log.known & (log.chosen == ids)
         slots: dict[int, dict[int, bytes]] = {}
@@ -114,8 +114,8 @@ class RealtimeCheck:
             unsent[sent.slot, sent.sender - 1] = False
         for row in range(len(log)):
             if row in slots or unsent[row].any():
-                judge.slot(row, slots.get(row, {}), unrecorded=ids[unsent[row]].tolist())
-        self._result.take_judgement(judge)
+                judge.check_slot(row, slots.get(row, {}), unrecorded=ids[unsent[row]].tolist())
+        self._result.note_rules(judge)
 
     def _note_spread(self) -> None:
         log, spread = self._log, []

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import REASONS, Scenario
 from dtsa_bench.log.flight_log import FlightLog
-from dtsa_bench.log.knowledge import Ages
 from dtsa_bench.log.merged_bag import open_log
+from dtsa_bench.log.replay import MeanAges
 from dtsa_bench.pages.html import BINS, flatten, pack, reduce_bins, thin
-from dtsa_bench.runs.hearing import recorded_problem, sentence
+from dtsa_bench.runs.delivery import as_sentence, recorded_problem
 from dtsa_channel_sim.model.verdict import OUTCOMES
 
 from .distances import collision_m, distance_chart, list_crashes, pair_distances
@@ -38,7 +38,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
     followed, scenario = run.knowledge, run.scenario
     ages = followed.ages
     notes = [*run.notes, *followed.notes]
-    told = sentence(recorded_problem(run.file or path))
+    told = as_sentence(recorded_problem(run.file or path))
     if told and not any(note.startswith(told.partition(":")[0]) for note in notes):
         notes.append(told)
     if unknown := int((run.recorded & ~run.outcome_known).sum()):
@@ -62,7 +62,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "slots": _slots(run),
         "channel": _channel_use(run),
         "decisions": _reasons(run),
-        "sent_for": _sent_for(run),
+        "sent_for": _reasons_sent(run),
         "distances": distance_chart(distances, run),
         "ages": _ages(ages, run),
         "table": _table(run, ages, scenario),
@@ -142,7 +142,7 @@ def _reason_names(run: FlightLog) -> list[str]:
     return [REASONS[code] if code < len(REASONS) else str(code) for code in _reason_codes(run).tolist()]
 
 
-def _sent_for(run: FlightLog) -> list[str]:
+def _reasons_sent(run: FlightLog) -> list[str]:
     """Reasons for which something was sent."""
     codes = np.unique(_sender_reason(run))
     names = _reason_names(run)
@@ -196,7 +196,7 @@ def _reasons(run: FlightLog) -> dict[str, Any] | None:
     }
 
 
-def _ages(ages: Ages | None, run: FlightLog) -> dict[str, Any] | None:
+def _ages(ages: MeanAges | None, run: FlightLog) -> dict[str, Any] | None:
     if ages is None or not len(run):
         return None
 
@@ -223,7 +223,7 @@ def _ages(ages: Ages | None, run: FlightLog) -> dict[str, Any] | None:
     }
 
 
-def _table(run: FlightLog, ages: Ages | None, scenario: Scenario | None) -> list[dict[str, Any]]:
+def _table(run: FlightLog, ages: MeanAges | None, scenario: Scenario | None) -> list[dict[str, Any]]:
     """One row an agent."""
     frames, path = run.sent_frames, run.path
     rows = []

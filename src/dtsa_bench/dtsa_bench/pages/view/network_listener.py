@@ -28,7 +28,7 @@ from dtsa_agent.core.station import (
 )
 from dtsa_agent.keys import authenticator
 from dtsa_bench.log.merged_flight import slots_until_all_known
-from dtsa_bench.log.rules import Judge
+from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.pages.html import pack
 from dtsa_bench.runs.config import REALTIME, RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS
@@ -59,7 +59,7 @@ class ListenedRun:
         self._scenario = make_scenario(config)
         self._tables = make_swarm(config, self._scenario, local=[], observers=[0])
         self._builder = MomentBuilder(self._scenario)
-        self._judge = Judge(config)
+        self._rules = RuleChecker(config)
         self._frames: dict[int, dict[int, tuple[bytes, bytes]]] = {}  # by slot, sender: with and without its tag
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
         self._absent = set(range(1, config.agents + 1))
@@ -131,8 +131,8 @@ class ListenedRun:
         self._tables.end(slot)
         if senders:
             self._builder.add_frames(slot, COLLISION if len(senders) > 1 else SUCCESS, senders, self._no_reason, None)
-            self._judge.slot(slot, {sender: frames[sender][0] for sender in senders})
-            broken, self._judge.broken = self._judge.broken, []
+            self._rules.check_slot(slot, {sender: frames[sender][0] for sender in senders})
+            broken, self._rules.broken = self._rules.broken, []
             for text in broken:
                 self._builder.add_event(slot, "bad", text)
         for sender in senders:
