@@ -1,8 +1,7 @@
-"""Integration: a byte that is changed in a bag is found, or it is one that nothing reads, and then it has a name."""
+"""Integration: verify finds a byte that was changed in a bag, wherever it stands."""
 
 from __future__ import annotations
 
-import contextlib
 import random
 from collections import Counter
 from pathlib import Path
@@ -15,8 +14,8 @@ from mcap.opcode import Opcode
 
 from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import SwarmConfig
-from dtsa_bench.log.bag.errors import UnusableBag
-from dtsa_bench.log.bag.reader import MAGIC, PREFIX, Bag
+from dtsa_agent.core.errors import DtsaError
+from dtsa_bench.log.bag.reader import MAGIC, PREFIX
 from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.verify.check import verify_bag
 
@@ -25,6 +24,7 @@ KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
 KINDS = ("lockstep", "realtime", "udp", "merged", "recovered", "sealed")
 POLICIES = ("lease", "tdma", "aloha", "age")  # of flights of nodes
 SEEDS = [pytest.param(seed, marks=[pytest.mark.sample] * (seed == 1)) for seed in range(1, 11)]
+CHANGES = 5  # of each bag, one byte at a time
 _CHUNK_HEAD = 40  # bytes of a chunk before the name of its compression
 
 
@@ -65,16 +65,7 @@ def make_bag(kind: str, directory: Path, seed: int) -> tuple[Path, list[Path]]:
     return out, files
 
 
-def contents(files: list[Path]) -> list[Any]:
-    """All that is read of bags: messages and what their recorders say."""
-    found: list[Any] = []
-    for file in files:
-        with Bag(file) as bag:
-            found += [sorted(bag.custom_data.items()), sorted(bag.topics.items()), *bag.messages()]
-    return found
-
-
-def name_of(data: bytes, place: int) -> str:
+def name_of(data: bytes | bytearray, place: int) -> str:
     """The part of an MCAP file in which a byte stands."""
     position = len(MAGIC)
     while position < len(data) - len(MAGIC):
@@ -89,13 +80,11 @@ def name_of(data: bytes, place: int) -> str:
 def is_found(path: Path) -> bool:
     try:
         return not verify_bag(path).ok
-    except UnusableBag:
+    except DtsaError:
         return True
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=[pytest.mark.sample] * (seed == 1)) for seed in range(1, 11)]
-)
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_changed_byte(kind: str, seed: int, tmp_path: Path, monkeypatch: Any, record: list[dict[str, Any]]) -> None:
     pytest.importorskip("dtsa_msgs.msg")
@@ -103,24 +92,21 @@ def test_changed_byte(kind: str, seed: int, tmp_path: Path, monkeypatch: Any, re
     path, files = make_bag(kind, tmp_path, seed)
     result, pick = verify_bag(path), random.Random(f"{kind} {seed}")
     assert result.ok, result.difference
-    file, whole = pick.choice(files), contents(files)
+    file = pick.choice(files)
     data = bytearray(file.read_bytes())
-    place = pick.randrange(len(data))
-    data[place] ^= 1 << pick.randrange(8)
-    file.write_bytes(data)
-    found, name = is_found(path), name_of(file.read_bytes(), place)
-    if not found:  # then nothing that is read has changed
-        with contextlib.suppress(UnusableBag):
-            assert contents(files) == whole, name
-    record.append({"kind": kind, "found": found, "name": name})
-    print(f"{kind} {seed}: byte {place} of {len(data)}, {name}: {'found' if found else 'read by nothing'}")
+    for _ in range(CHANGES):
+        place, bit = pick.randrange(len(data)), 1 << pick.randrange(8)
+        data[place] ^= bit
+        file.write_bytes(data)
+        found, data[place] = is_found(path), data[place] ^ bit
+        record.append({"kind": kind, "found": found, "name": name_of(data, place)})
+        assert found, f"byte {place} of {len(data)}: {name_of(data, place)}"
 
 
 def summarise(found: list[dict[str, Any]]) -> tuple[list[str], list[list[object]]]:
     rows: list[list[object]] = []
     for kind in KINDS:
-        bags = [row for row in found if row["kind"] == kind]
-        names = Counter(row["name"] for row in bags if not row["found"])
-        missed = ", ".join(f"{count} in {name}" for name, count in sorted(names.items())) or "none"
-        rows.append([kind, f"{sum(row['found'] for row in bags)} of {len(bags)}", missed])
-    return ["bag", "found", "read by nothing"], rows
+        changes = [row for row in found if row["kind"] == kind]
+        names = ", ".join(f"{count} {name}" for name, count in sorted(Counter(row["name"] for row in changes).items()))
+        rows.append([kind, f"{sum(row['found'] for row in changes)} of {len(changes)}", names])
+    return ["bag", "changes found", "where they were"], rows

@@ -33,7 +33,7 @@ from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_bench.log.arrays import NEW
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
-from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, register_type
+from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, checksum_fault, register_type
 from dtsa_bench.log.bag.recover import RecordScan
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
 from dtsa_bench.log.record import (
@@ -71,7 +71,8 @@ class AgentBag:
     slots: list[SlotRecord] = field(default_factory=list)  # ascending, but where it took over another time
     refused: Counter[str] = field(default_factory=Counter)  # datagrams not accepted, by reason
     summary: dict[str, Any] = field(default_factory=dict)  # its own; empty: it was killed
-    broken_off: bool = False  # the file was not finished
+    broken_off: bool = False  # the file was not finished, or is damaged
+    damage: str = ""  # why a finished file is not as it was finished; empty: it is
     goals_told: bool = False  # it was told goals in flight: none was known to be its last
     zero_ns: int = 0  # what its clock showed at time 0 of the bag
 
@@ -258,7 +259,10 @@ def read(path: str | Path) -> AgentBag:
         why = f"not readable ({scan.faults[0]})" if scan.faults else (
             f"no bag of an agent on a network, as `{program()} agent --out` makes them")  # fmt: skip
         raise UnusableBag(file, why)
-    return reader.finish(scan.is_finished)
+    bag = reader.finish(scan.is_finished and not scan.faults)
+    if scan.is_finished or scan.is_closed:
+        bag.damage = scan.faults[0] if scan.faults else checksum_fault(file)
+    return bag
 
 
 class _Reader:

@@ -19,6 +19,7 @@ from typing import IO, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import breakup_chunk
@@ -35,6 +36,7 @@ from .schema import Definition
 
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
+_DATA_END = struct.Struct("<BQI")  # opcode, length, checksum of all that stands before it; 0: none
 _END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
 _ROS = "cdr/ros2msg"
 _MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
@@ -75,7 +77,7 @@ class Bag:
 
     def __init__(self, path: str | Path) -> None:
         self.given = Path(path)
-        paths = metadata.find_files(self.given)
+        paths = self._paths = metadata.find_files(self.given)
         self.path = paths[0]
         with ExitStack() as stack:
             self._open([(part, stack.enter_context(metadata.open_file(part))) for part in paths])
@@ -244,6 +246,15 @@ class Bag:
         for message in self.messages(topics):
             yield message, self.decode(message)
 
+    def check_files(self) -> None:
+        """Whether the files are as they were finished, by their checksums; it takes a pass over them.
+
+        :raises UnusableBag: if one is not.
+        """
+        for path in self._paths:
+            if fault := checksum_fault(path):
+                raise self._damaged(f"{path.name}: {fault}")
+
     def close(self) -> None:
         """Close the files."""
         self._files.close()
@@ -267,6 +278,26 @@ def register_type(store: Typestore, kind: str, definition: str) -> None:
             raise ValueError("it is not of the form package/msg/Type")
     except Exception as error:  # the parser meets texts from outside with many kinds of errors
         raise ValueError(f"its definition cannot be used: {error}".partition("\n")[0]) from None
+
+
+def checksum_fault(path: Path) -> str:
+    """What the checksums of a finished file say against it; empty: nothing. A change of any of its bytes shows."""
+    try:
+        with metadata.open_file(path) as stream:
+            read_index(stream)
+            stream.seek(-_END.size, 2)
+            start, _, _, mark = _END.unpack(stream.read())
+            stream.seek(start - _DATA_END.size)
+            opcode, length, checksum = _DATA_END.unpack(stream.read(_DATA_END.size))
+            if mark != MAGIC or opcode != Opcode.DATA_END or length != _DATA_END.size - PREFIX.size:
+                return "the end of its messages is damaged"
+            stream.seek(0)
+            left, found = start - _DATA_END.size, 0
+            while left and (block := stream.read(min(left, 1 << 20))):
+                left, found = left - len(block), zlib.crc32(block, found)
+    except Exception as error:  # the library meets damaged files with many kinds of errors
+        return f"its index is damaged ({error or type(error).__name__})"
+    return "" if checksum in (0, found) else "its contents do not fit their checksum"
 
 
 def read_index(stream: IO[bytes]) -> tuple[SeekingReader, Summary | None]:

@@ -129,11 +129,13 @@ class RecordScan:
         self.counts: dict[int, int] = {}  # messages by channel, likewise
         self.about: dict[str, Any] = {}  # what the recorder says of the bag, likewise
         self.is_finished = False  # whether reading has come to the end of the messages
+        self.is_closed = False  # whether the file has an end
         self._tried = 0  # bytes of what looked like chunks
         stream = stack.enter_context(metadata.open_file(path))
         if stream.read(len(MAGIC)) != MAGIC:
             raise UnusableBag(given, f"{path.name} is not an MCAP file, or its beginning is lost")
         self._data = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+        self.is_closed = self._data[-len(MAGIC) :] == MAGIC and len(self._data) > len(MAGIC)
         with suppress(Exception):  # of a damaged file: whatever the library meets, there is no index then
             reader, summary = read_index(stream)
             self.summary = summary or self.summary

@@ -111,7 +111,8 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         size = _UNLIMITED if marked else chunk_size
-        self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
+        kind = COMPRESSIONS[compression]
+        self._mcap = Writer(self._stream, chunk_size=size, compression=kind, enable_data_crcs=True)
         with self._failing():
             self._mcap.start(profile=profile, library=f"dtsa {__version__}")
             self._add_own_metadata()

@@ -12,8 +12,8 @@ from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.writer import BROKEN_OFF
-from dtsa_bench.log.agent_bag import find_bags
-from dtsa_bench.log.merged_bag import merge_bags
+from dtsa_bench.log.agent_bag import find_bags, read_all
+from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, build_log, check_format
 from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.config import LOCKSTEP, REALTIME
@@ -68,9 +68,13 @@ def _noting(result: Result, check: Callable[[], None]) -> None:
         result.difference = Difference("a message", "valid CDR of its type", "other bytes", str(error))
 
 
-def _verify_agents(bags: Sequence[Path], result: Result) -> None:
+def _verify_agents(paths: Sequence[Path], result: Result) -> None:
     """The agents' bags of a flight, joined."""
-    check_merged(merge_bags(bags), result)
+    bags, nothing_written = read_all(paths)
+    check_merged(Merge(bags, nothing_written).log, result)
+    for bag in bags:
+        if bag.damage:
+            raise UnusableBag(bag.path, bag.damage)
 
 
 def _check_sniffed(log: FlightArrays, result: Result) -> None:
@@ -106,6 +110,7 @@ def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) ->
         RealtimeCheck(log, contents, result).check()
     contents.check_odometry(log)
     contents.check_digest()
+    bag.check_files()
     for topic in bag.topics:
         if topic not in (SLOT_RECORD, EVENTS) and not topic.endswith("/odom"):
             result.skipped[topic] = "carries nothing that is not in other topics; covered by the digest"
