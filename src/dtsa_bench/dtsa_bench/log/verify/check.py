@@ -22,7 +22,7 @@ from dtsa_bench.runs.delivery import recorded_problem
 from .contents import EVENTS, MERGED, BagContents
 from .lockstep import check_lockstep
 from .merged import check_merged
-from .realtime import RealtimeCheck
+from .realtime import check_realtime
 from .result import Difference, Mismatch, Result
 
 
@@ -107,7 +107,7 @@ def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) ->
     elif mode == LOCKSTEP:
         check_lockstep(log, contents, result, progress)
     else:
-        RealtimeCheck(log, contents, result).check()
+        check_realtime(log, contents, result)
     contents.check_odometry(log)
     contents.check_digest()
     bag.check_files()
