@@ -158,7 +158,7 @@ def log_of_flight(flight: SimulatedFlight) -> FlightLog:
     config, slots = flight.run.swarm, len(arrays)
     heard, received = None, arrays.received
     if flight.accepted is not None:  # who accepted a frame that arrived, received its sender's
-        heard, received = _heard_frames(flight, config.agents), received.copy()
+        heard, received = _received_frames(flight, config.agents), received.copy()
         place = np.cumsum(arrays.sent).reshape(arrays.sent.shape) - 1
         for frame in flight.accepted:
             sender, slot = named_in(frame.data) or (0, 0)
@@ -177,7 +177,7 @@ def log_of_flight(flight: SimulatedFlight) -> FlightLog:
     )  # fmt: skip
 
 
-def _heard_frames(flight: SimulatedFlight, agents: int) -> ReceivedFrames:
+def _received_frames(flight: SimulatedFlight, agents: int) -> ReceivedFrames:
     frames = flight.accepted or []
     row, slot = (np.array([getattr(frame, name) for frame in frames], np.int64) for name in ("row", "slot"))
     by, none = np.array([frame.by for frame in frames], np.bool_).reshape(len(frames), agents), np.zeros_like(row)

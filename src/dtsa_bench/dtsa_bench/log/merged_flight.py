@@ -51,7 +51,7 @@ class PairKnowledge:
         self._pairs = self._known = self._age_max = 0
         self._oldest: tuple[int, int] | None = None
 
-    def add_heard(self, log: FlightArrays, row: int) -> None:
+    def add_received(self, log: FlightArrays, row: int) -> None:
         """Count what agents heard in a slot."""
         if log.heard is None:
             return
@@ -194,7 +194,7 @@ class MergedReplay:
                 process.replay.step(part, row)
                 for name in _KEPT:
                     getattr(tables, name)[observers.index(process.agent)] = getattr(process.replay.swarm, name)[0]
-            pairs.add_heard(part, row)
+            pairs.add_received(part, row)
             counts = begins <= slot < last
             if counts and start is None:
                 counts = not any(_is_new(process.replay.swarm) for process in active)

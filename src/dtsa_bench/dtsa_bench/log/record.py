@@ -203,7 +203,7 @@ class _Rows:
                 self._add_accounts([record], self._columns(record))
             row = int(record.slot) - self._first
             self._add_frames(record, row)
-            self._add_heard(record, row)
+            self._add_received(record, row)
         if end is not None:
             self._end(end)
         self.has_end = end is not None
@@ -226,7 +226,7 @@ class _Rows:
         arrays, count, steps = self._arrays, len(records[0].agent), self._arrays["track"].shape[1]
         rows = np.array([int(record.slot) - self._first for record in records])
 
-        def put(name: str, shape: tuple[int, ...], index: Any) -> None:
+        def fill(name: str, shape: tuple[int, ...], index: Any) -> None:
             size = math.prod(shape)
             values = [getattr(record, name) for record in records]
             for record, found in zip(records, values, strict=True):
@@ -240,10 +240,10 @@ class _Rows:
         stamps = [(int(record.header.stamp.sec), int(record.header.stamp.nanosec)) for record in records]
         arrays["start_ns"][rows] = [sec * _SECOND + ns - names.TIME_ZERO_NS for sec, ns in stamps]
         for name in _DECIDED:
-            put(name, (count,), own)
+            fill(name, (count,), own)
         planes = (rows, slice(None), at) if isinstance(at, slice) else (rows[:, None, None], np.arange(3)[:, None], at)
         for name in ("velocity", "command", "goal"):
-            put(name, (3, count), planes)
+            fill(name, (3, count), planes)
         for row, record in zip(rows.tolist(), records, strict=True):
             arrays["track"][row][:, :, at] = record.track.reshape(steps, 3, count)
             if len(record.offset_ns):
@@ -271,7 +271,7 @@ class _Rows:
                 raise ValueError(f"slot {record.slot}: an empty frame of cf{sender}")
             self._frames[row, sender], self._received[row, sender] = data, mask
 
-    def _add_heard(self, record: Any, row: int) -> None:
+    def _add_received(self, record: Any, row: int) -> None:
         count = len(record.heard_sender)
         self._own_clocks = self._own_clocks or count > 0 or len(record.offset_ns) > 0
         if not count:
@@ -289,7 +289,7 @@ class _Rows:
         arrays, keys = self._arrays, sorted(self._frames)
         received = np.array([self._received[key] for key in keys], np.bool_).reshape(len(keys), self.agents)
         self._own_clocks = self._own_clocks or settings.get("mode") == names.MODES[1]
-        heard = self._heard_frames() if self._own_clocks else None
+        heard = self._received_frames() if self._own_clocks else None
         presence, sent_ns = arrays.pop("presence"), arrays.pop("sent_ns")
         return FlightLog(
             name=name, settings=settings, agents=self.agents, slot_ns=self.slot_ns,
@@ -298,7 +298,7 @@ class _Rows:
             first_slot=self._first, has_end=self.has_end, **arrays,
         )  # fmt: skip
 
-    def _heard_frames(self) -> ReceivedFrames:
+    def _received_frames(self) -> ReceivedFrames:
         frames = [
             data or self._frames.get((slot - self._first, sender), b"")
             for _, sender, slot, _, _, _, data in self._heard

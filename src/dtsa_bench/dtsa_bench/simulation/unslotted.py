@@ -152,8 +152,8 @@ class UnslottedTraffic:
         swarm.emit(slot)
         self._frames = [swarm.frame(index) for index in range(len(swarm.ids))]
         self._act(end_ns)
-        self._settle(end_ns)
-        self._take_in(end_ns)
+        self._resolve(end_ns)
+        self._deliver(end_ns)
         self._carried.senders = tuple(swarm.ids[index] for index in sorted(self._began))
         swarm.sends[:] = 0
         swarm.sends[sorted(self._began)] = 1
@@ -167,9 +167,9 @@ class UnslottedTraffic:
             heard = self._radios.next if self._radios is not None else (NEVER, 0)
             next_ns = min(wake, heard)[0]
             if self._reacts and self._air.due_ns <= min(next_ns, end_ns):
-                self._settle(self._air.due_ns)
+                self._resolve(self._air.due_ns)
             elif self._reacts and self._arriving and self._arriving[0][0] <= min(next_ns, end_ns - 1):
-                self._take_in(self._arriving[0][0])
+                self._deliver(self._arriving[0][0])
             elif next_ns >= end_ns:
                 return
             elif heard[0] < NEVER and (heard[0], heard[1] - 1) < wake:
@@ -273,7 +273,7 @@ class UnslottedTraffic:
         if not 1 <= length <= self._airtime.longest:
             policy = self._swarm.policies[index].name
             raise PluginError(f"{policy}, wake", f"sent {length} bytes; allowed: 1 to {self._airtime.longest}")
-        self._settle(now_ns)
+        self._resolve(now_ns)
         self._count += 1
         self._air.begin(self._count, packet.sender, at_ns, length)
         self._free_ns[index] = at_ns + self._airtime.total_ns(length)
@@ -282,7 +282,7 @@ class UnslottedTraffic:
             self._began.add(index)
         self._carried.lengths.append(length)
 
-    def _settle(self, until_ns: int) -> None:
+    def _resolve(self, until_ns: int) -> None:
         for verdict in self._air.settle(until_ns, self._swarm.position):
             packet = self._on_air.pop(verdict.frame_id)
             if verdict.received.any():
@@ -292,7 +292,7 @@ class UnslottedTraffic:
             else:
                 self._carried.outcome = SUCCESS
 
-    def _take_in(self, until_ns: int) -> None:
+    def _deliver(self, until_ns: int) -> None:
         """What has arrived is heard; policies that react do so."""
         while self._arriving and self._arriving[0][0] <= until_ns:
             now_ns, _, packet, received = heappop(self._arriving)

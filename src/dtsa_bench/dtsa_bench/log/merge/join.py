@@ -71,7 +71,7 @@ def join(
     log = FlightLog(
         name="", settings=_settings(config), agents=config.agents, slot_ns=config.slot_ns, first_slot=first,
         data=b"".join(frames[key][1] for key in keys), received=np.zeros((len(keys), config.agents), np.bool_),
-        heard=_heard_frames(heard, config), has_end=False,
+        heard=_received_frames(heard, config), has_end=False,
         merged={**about, "common_slot": common_slot, "processes": [_describe(*one) for one in processes.items()]},
         **arrays,
     )  # fmt: skip
@@ -95,7 +95,7 @@ def _add_account(
     return own_ns
 
 
-def _heard_frames(heard: list[tuple[int, int, Heard, int, bool]], config: SwarmConfig) -> ReceivedFrames:
+def _received_frames(heard: list[tuple[int, int, Heard, int, bool]], config: SwarmConfig) -> ReceivedFrames:
     by = np.zeros((len(heard), config.agents), np.bool_)
     by[np.arange(len(heard)), np.array([column for _, column, *_ in heard], np.intp)] = True
     numbers = [(row, one.sender, one.slot, at_ns) for row, _, one, at_ns, _ in heard]

@@ -82,7 +82,7 @@ def _check_decisions(
 ) -> None:
     """What agents took in had been delivered to them, and their decisions follow from it."""
     assert log.heard is not None
-    count, delays = frames.check_heard(log.heard, len(log))
+    count, delays = frames.check_received(log.heard, len(log))
     result.count("frames taken in as they were delivered", count)
     delivery = DeliveryCounts(log.agents, len(log), int(log.sent.sum()), int(log.received.sum()), count)
     result.unheard = delivery.problem(summary.get("not_taken_in"))
