@@ -43,10 +43,10 @@ def why_without_ages(log: FlightArrays) -> str:
         config = recorded_config(log.settings)
         make_scenario(config.swarm)
     except (DtsaError, TypeError, ValueError) as error:
-        return f"MeanAges, estimates and results are left out: the configuration cannot be used ({error})."
+        return f"Ages, estimates and results are left out: the configuration cannot be used ({error})."
     complete = len(log) and log.recorded.all() and log.agents == config.swarm.agents
     if not complete or (log.merged is None and not log.known.any(axis=0).all()):
-        return f"MeanAges, estimates and results are left out: {log.missing or 'all slots'} are missing in the bag."
+        return f"Ages, estimates and results are left out: {log.missing or 'all slots'} are missing in the bag."
     return ""
 
 
