@@ -88,7 +88,7 @@ class Sniffer:
             self._judged = over
 
     def _close_slot(self, slot: int) -> None:
-        """RuleChecker a slot, and record it: its time is that of the first frame that was heard in it."""
+        """Check a slot, and record it: its time is that of the first frame that was heard in it."""
         heard = dict(sorted(self._slots.pop(slot).items()))
         frames = {sender: data for sender, (_, data) in heard.items()}
         self._rules.check_slot(slot, frames)
