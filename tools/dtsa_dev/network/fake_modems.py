@@ -20,7 +20,7 @@ from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.serial.modems import MODEMS, Modem
+from dtsa_agent.air.serial_modems import MODEMS, Modem
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.medium import OnAir
 
@@ -269,7 +269,7 @@ class FakeModems:
             one for one in self._air if one is not frame and one.start_ns < frame.end_ns and one.end_ns > frame.start_ns
         ]
         slot = self._slot(frame.start_ns)
-        received, lost, collided = self._channel.medium(slot).judge(slot, frame, others)
+        received, lost, collided = self._channel.medium(slot).resolve(slot, frame, others)
         self._channel.advance(slot)
         self.counts["lost"] += lost
         self.counts["collided"] += collided

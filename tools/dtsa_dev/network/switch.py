@@ -20,9 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dtsa_agent.air.datagram import HEADER
-from dtsa_agent.air.process import wake_precisely
+from dtsa_agent.air.port import HEADER
 from dtsa_agent.core.frame import named_in
+from dtsa_agent.priority import wake_precisely
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
 from .hosts import Host, arrived
@@ -134,7 +134,7 @@ class Switch:
         return packet[head + 8 : head + int.from_bytes(packet[head + 4 : head + 6], "big")]
 
     def _settle(self, until_ns: int) -> None:
-        for verdict in self._air.settle(until_ns):
+        for verdict in self._air.resolve(until_ns):
             frame, agent, slot = self._frames.pop(verdict.frame_id)
             numbers = [int(k) + 1 for k in np.flatnonzero(verdict.received) if int(k) + 1 in self._cables]
             for number in numbers:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from dtsa_agent.air.datagram import check_fits
+from dtsa_agent.air.port import check_fits
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core.station import check_joinable
 from dtsa_bench.runs.options import add_options, given_options, number

@@ -9,8 +9,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from dtsa_agent.air.port import PortSettings
-from dtsa_agent.air.ports import AIRS, settings_class
+from dtsa_agent.air.port import AIRS, PortSettings, settings_class
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError

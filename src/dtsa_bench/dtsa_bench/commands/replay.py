@@ -48,8 +48,7 @@ def run(args: argparse.Namespace) -> int:
     import rclpy
 
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_agent.ros.common.process.node_process import init_ros
-    from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+    from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
     from dtsa_bench.log.bag.reader import Bag
     from dtsa_bench.log.bag.replay import Player, RosOutput
 

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     parser.usage = "%(prog)s [OPTIONS]"
     parser.add_argument("bags", nargs="*", help=argparse.SUPPRESS)
-    from dtsa_agent.air.ports import AIRS
+    from dtsa_agent.air.port import AIRS
 
     parser.add_argument("--air", choices=(_ROS, *AIRS), help="what carries the swarm's frames [ros]")
     parser.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the swarm")
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         history = RunHistory(settings.where)
         source = NetworkListener(history, config, settings)
     else:
-        from dtsa_agent.ros.common.graph import names
+        from dtsa_agent.ros.common import names
         from dtsa_bench.pages.view.graph import GraphSource
 
         domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)

@@ -21,15 +21,15 @@ import numpy as np
 from mcap.records import Channel, Message, Metadata, Schema
 from rosbags.typesys import Stores, get_typestore
 
-from dtsa_agent.air.datagram import flight_ns, frame_in
+from dtsa_agent.air.port import flight_ns, frame_in
 from dtsa_agent.air.port import PortProperties, PortSettings
-from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import TAG_LENGTH
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench.log.arrays import NEW
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
@@ -152,7 +152,7 @@ class AgentRecorder:
         if len(self._slots) >= _AT_A_TIME:
             self._write_slots()
 
-    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
+    def refused(self, reason: str, data: bytes, arrival_ns: int) -> None:
         """A datagram has not been accepted: the agent's summary counts these."""
 
     def _write_slots(self) -> None:
@@ -166,7 +166,7 @@ class AgentRecorder:
         sent = {self._id: record.datagram} if is_sent else {}
         return pack_record(
             self._config.auth_session or 1, record.slot, zero_ns - self._zero_ns + names.TIME_ZERO_NS,
-            len(record.track), agent=[self._id], presence=[record.present | (NEW if record.anew else 0)],
+            len(record.track), agent=[self._id], presence=[record.present | (NEW if record.is_first else 0)],
             chosen=[record.chosen], reason=[record.reason], digest=[record.digest], score=[record.score],
             offset_ns=[record.sent_ns - zero_ns if is_sent else 0], track=record.track, velocity=record.velocity,
             command=record.command, goal=record.goal, **frame_fields(sent, None),
@@ -371,7 +371,7 @@ def _add_slot(bag: AgentBag, message: Any) -> None:
     frames = cut_frames(message.heard_data, message.heard_length, len(message.heard_sender))
     is_before = message.heard_before.tolist() or [0] * len(frames)
     columns = zip(message.heard_sender.tolist(), message.heard_slot.tolist(), message.heard_ns.tolist(), frames, strict=True)
-    heard = [Heard(sender, slot, start_ns + at_ns, data, True) for sender, slot, at_ns, data in columns]
+    heard = [ReceivedFrame(sender, slot, start_ns + at_ns, data, True) for sender, slot, at_ns, data in columns]
     datagram = message.data.tobytes() if is_sent else b""
     frame = frame_in(datagram, bag.swarm)
     record = SlotRecord(
@@ -382,6 +382,6 @@ def _add_slot(bag: AgentBag, message: Any) -> None:
         before=[one for one, early in zip(heard, is_before, strict=True) if early],
         heard=[one for one, early in zip(heard, is_before, strict=True) if not early],
     )  # fmt: skip
-    if bag.slots and record.slot <= bag.slots[-1].slot and not record.anew:
+    if bag.slots and record.slot <= bag.slots[-1].slot and not record.is_first:
         raise UnusableBag(bag.path, f"slot {record.slot} comes after slot {bag.slots[-1].slot}")
     bag.slots.append(record)

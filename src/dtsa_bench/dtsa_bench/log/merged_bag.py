@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.cdr import COLLIDED, SENDING, WAITING, MarkerPacker, OdometryPacker
 from dtsa_bench.log.bag.errors import BagError

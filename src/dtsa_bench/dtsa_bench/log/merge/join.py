@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.datagram import frame_in
-from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.port import frame_in
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.log.agent_bag import AgentBag
 from dtsa_bench.log.arrays import NEW, UNKNOWN, FlightArrays, ReceivedFrames, empty_arrays, split_log
@@ -49,7 +49,7 @@ def join(
     arrays["start_ns"] += first * config.slot_ns
     arrays["recorded"][:] = True
     frames: dict[tuple[int, int], tuple[int, bytes]] = {}  # by row and sender: when, and what
-    heard: list[tuple[int, int, Heard, int, bool]] = []  # row, column of the receiver, frame, when, before the slot
+    heard: list[tuple[int, int, ReceivedFrame, int, bool]] = []  # row, column of the receiver, frame, when, before the slot
     for process, bag in sorted(processes.items()):
         column, to_common = process[0] - 1, times[process]
         for record in bag.slots:
@@ -85,7 +85,7 @@ def _add_account(
     """Add what an agent recorded of a slot; return when its slot, or its frame, started, ns of the common line."""
     own_ns = max(0, to_common(record.sent_ns)) if record.datagram else to_common(record.start_ns)
     arrays["known"][row, column] = True
-    arrays["presence"][row, column] = record.present | (NEW if record.anew else 0)
+    arrays["presence"][row, column] = record.present | (NEW if record.is_first else 0)
     arrays["offset_ns"][row, column] = own_ns - arrays["start_ns"][row]
     for name in _DECIDED:
         arrays[name][row, column] = getattr(record, name)
@@ -95,7 +95,7 @@ def _add_account(
     return own_ns
 
 
-def _received_frames(heard: list[tuple[int, int, Heard, int, bool]], config: SwarmConfig) -> ReceivedFrames:
+def _received_frames(heard: list[tuple[int, int, ReceivedFrame, int, bool]], config: SwarmConfig) -> ReceivedFrames:
     by = np.zeros((len(heard), config.agents), np.bool_)
     by[np.arange(len(heard)), np.array([column for _, column, *_ in heard], np.intp)] = True
     numbers = [(row, one.sender, one.slot, at_ns) for row, _, one, at_ns, _ in heard]
