@@ -12,7 +12,7 @@ import pytest
 from fly_helpers import fly
 from mcap.opcode import Opcode
 
-from dtsa_agent.air.udp import UdpSettings
+from dtsa_agent.air.settings import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.log.bag.reader import MAGIC, PREFIX
