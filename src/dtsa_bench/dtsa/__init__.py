@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig, Verdict
 
     from . import env
-    from ._flights import open, run_config, simulate, verify
+    from ._flights import open, register, run_config, simulate, verify
     from ._plots import plot_ages, plot_bars, plot_distances, plot_lines, plot_matrix, plot_trajectories
-    from ._plugins import register
     from ._sweep import SweepResult, sweep
 
 __all__ = [
@@ -82,9 +81,8 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "dtsa._flights": ("open", "run_config", "simulate", "verify"),
+    "dtsa._flights": ("open", "register", "run_config", "simulate", "verify"),
     "dtsa._plots": ("plot_ages", "plot_bars", "plot_distances", "plot_lines", "plot_matrix", "plot_trajectories"),
-    "dtsa._plugins": ("register",),
     "dtsa._sweep": ("SweepResult", "sweep"),
     "dtsa_agent.core": (
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "PluginError", "RemoteProtocolError",

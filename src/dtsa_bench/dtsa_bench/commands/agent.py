@@ -7,7 +7,7 @@ import argparse
 from dtsa_agent.air.port import check_fits
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core.station import check_joinable
-from dtsa_bench.runs.options import add_options, given, number
+from dtsa_bench.runs.options import add_options, given_options, number
 
 from .network_options import add_network_options, add_results, read_network_options
 
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_bench.network.flying import AgentJob, check, fly
 
     port, config = read_network_options(args)
-    own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
+    own = AgentSettings.from_dict(given_options(args, AgentSettings, "own"))
     check_joinable(config.policy)  # before anything is made
     check_fits(config, port.properties)
     job = AgentJob(own, config, port, args.out, args.json)

@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting, Settings, names_with_values, settings_of
 from dtsa_agent.keys import check_key, check_session
 from dtsa_agent.yaml_file import read_yaml
-from dtsa_bench.runs.options import add_options, given
+from dtsa_bench.runs.options import add_options, given_options
 
 from .registry import hint
 
@@ -72,7 +72,7 @@ def read_network_options(args: argparse.Namespace) -> tuple[PortSettings, SwarmC
         for name, value in values.items() if value is not None
     })  # fmt: skip
     named = {"policy": args.policy or DEFAULT_POLICY, "auth": args.seal is not False}
-    config = SwarmConfig.from_dict({**given(args, SwarmConfig, "swarm"), **named})
+    config = SwarmConfig.from_dict({**given_options(args, SwarmConfig, "swarm"), **named})
     check_key(config)  # before anything is made
     check_session(config)
     return port, config

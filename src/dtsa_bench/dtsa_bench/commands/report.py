@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the report."""
     from dtsa_bench.log.bag.metadata import bag_of
-    from dtsa_bench.pages.report.page import write_report
+    from dtsa_bench.pages.report.data import write_report
 
     first = bag_of(args.bags[0]).resolve()
     out = Path(args.out) if args.out else first.parent / "report.html"

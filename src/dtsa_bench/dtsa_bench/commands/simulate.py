@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dtsa_bench.simulation.simulate import Flight
+    from dtsa_bench.simulation.simulate import SimulatedFlight
 
 DESCRIPTION = """\
 Flies one run without ROS, as fast as this machine allows, over the same core as the nodes. For equal options
@@ -71,7 +71,7 @@ def _checked(picture: Path) -> Path:
     return picture
 
 
-def _draw(picture: Path, flight: Flight, summary: dict[str, Any]) -> None:
+def _draw(picture: Path, flight: SimulatedFlight, summary: dict[str, Any]) -> None:
     from dtsa_bench.drawing import optional_picture
 
     assert flight.log is not None

@@ -14,7 +14,7 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.commands import agent, sniff, view
 from dtsa_bench.commands.network_options import read_network_options
-from dtsa_bench.runs.options import given
+from dtsa_bench.runs.options import given_options
 
 SHARED = """\
 air: udp
@@ -46,7 +46,7 @@ def test_settings_of_a_file_stand_for_options_and_options_go_before_them(tmp_pat
     wanted = SwarmConfig(agents=12, policy="tdma", slot_ms=30.0, epsilon=0.3, auth=False)
     assert swarm == wanted
     assert (port.to_dict()["group"], port.to_dict()["interface"]) == ("239.1.2.3:9", "lo")
-    assert given(args, AgentSettings, "own") == {"id": 3, "priority": 0}
+    assert given_options(args, AgentSettings, "own") == {"id": 3, "priority": 0}
     for module in (sniff, view):
         _, port, swarm = parsed(["--swarm", str(path)], module)
         assert swarm.slot_ms == 20.0
