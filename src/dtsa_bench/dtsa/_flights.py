@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,32 +14,54 @@ from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import simulate as _simulate
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from dtsa_bench.log.verify.result import Result
 
+    from ._settings import RunSettings
 
-def run_config(**settings: Any) -> RunConfig:
+
+def run_config(**settings: Unpack[RunSettings]) -> RunConfig:
     """The configuration of a run from settings by name.
 
     :param settings: settings of the swarm, of the channel and of the end of a run side by side, such as
         `agents=12, loss=0.1, timeout_s=20`, with the units and ranges of :class:`SwarmConfig`, :class:`ChannelConfig`
         and :class:`RunLimits`. `seed` is that of the swarm and of the channel.
+
+    >>> run_config(agents=18, policy="lease", loss=0.05).swarm
+    SwarmConfig(agents=18, moving=18, policy='lease')
+
     :raises ConfigError: for a name that does not exist or a value that is not allowed.
     """
     return _run_config(settings)
 
 
-def simulate(config: RunConfig | None = None, *, trace: bool = True, **settings: Any) -> FlightLog:
+def config_of(config: RunConfig | None, settings: Mapping[str, Any]) -> RunConfig:
+    """Return a configuration, or make it from settings; ConfigError: both are there, or it is none."""
+    if config is None:
+        return _run_config(settings)
+    if not isinstance(config, RunConfig):
+        raise ConfigError("config", config, "a RunConfig, or settings by name, as in agents=12, loss=0.1")
+    if settings:
+        raise ConfigError("settings", sorted(settings), "none beside a config")
+    return config
+
+
+def simulate(config: RunConfig | None = None, *, trace: bool = True, **settings: Unpack[RunSettings]) -> FlightLog:
     """Fly one run without ROS; equal configurations give equal flights, bit for bit.
 
     :param config: the run; None: made from the settings.
     :param trace: keep what happened in every slot, which arrays, tables and figures need: about 150 bytes an agent and
         slot.
     :param settings: as for :func:`run_config`, if there is no config.
+
+    >>> flight = simulate(agents=4, policy="tdma", seed=3)
+    >>> flight.summary["end"], flight.path.shape  # control instants, xyz, agents; m
+    ('completed', (428, 3, 4))
+
     :raises ConfigError: for a setting that is not usable, or both a config and settings.
     """
-    if config is not None and settings:
-        raise ConfigError("settings", sorted(settings), "none beside a config")
-    run = run_config(**settings) if config is None else config
+    run = config_of(config, settings)
     flight = _simulate(run, log=trace, frames=trace)
     if flight.log is not None:
         return flight.to_log()

@@ -12,7 +12,7 @@ _REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in
 
 
 def register(kind: str, name: str, factory: Any) -> None:
-    """Makes a policy, estimator or avoider known to this process: `simulate` and `sweep` fly it by its name.
+    """Make a policy, estimator or avoider known to this process: `simulate` and `sweep` fly it by its name.
 
     Worker processes and nodes do not know it: for these announce it by an entry point, see docs/reference/plug-ins.md.
 
@@ -21,6 +21,15 @@ def register(kind: str, name: str, factory: Any) -> None:
     :param factory: a class, or a function that makes the part of one observer: called with the configuration and the
         observer's id (0: one that hears everything). A policy has `choose(table, slot)`, which gives the id of the
         sender; an estimator `estimate(table, slot, step, position, velocity)`; an avoider `command(table, slot, step)`.
+
+    >>> class Countdown:
+    ...     def __init__(self, config, agent):
+    ...         self.agents = config.agents
+    ...
+    ...     def choose(self, table, slot):
+    ...         return self.agents - slot % self.agents
+    >>> register("policy", "countdown", Countdown)
+
     :raises ConfigError: for a kind that does not exist, a built-in name, or a factory that cannot be called.
     """
     if kind not in _REGISTRIES:

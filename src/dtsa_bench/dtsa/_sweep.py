@@ -108,7 +108,7 @@ def sweep(
     out: str | Path | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> SweepResult:
-    """Flies every combination of some settings with every seed.
+    """Fly every combination of some settings with every seed.
 
     :param preset: a sweep that comes with the package (`dtsa sweep --list`), instead of axes.
     :param axes: name -> a list of values of the setting of that name, or names with settings each:
@@ -120,6 +120,11 @@ def sweep(
     :param out: directory for results.csv, results.json and a journal, with which an interrupted sweep goes on; None:
         nothing is written.
     :param progress: called with the number of flights done since the last call.
+
+    >>> result = sweep(axes={"loss": [0, 0.2], "policy": ["tdma", "lease"]}, base={"agents": 4}, seeds=2)
+    >>> result.table()[["loss", "policy", "runs", "crashed"]].values.tolist()
+    [[0.0, 'tdma', 2, 0.0], [0.0, 'lease', 2, 0.0], [0.2, 'tdma', 2, 0.0], [0.2, 'lease', 2, 0.0]]
+
     :raises ConfigError: for a setting that is not usable; nothing has flown then.
     :raises DtsaError: if worker processes keep dying.
     """

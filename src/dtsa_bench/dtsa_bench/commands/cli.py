@@ -119,11 +119,7 @@ def report(error: Exception) -> int:
 
     if not isinstance(error, DtsaError):
         raise error
-    near = ""
-    if isinstance(error, ConfigError):
-        words = re.split(r"\s*[,;]\s*|\s+or\s+", error.allowed)
-        near = hint(str(error.value), [word for word in words if re.fullmatch(r"[A-Za-z][\w.-]*", word)])
-    print(f"{PROGRAM}: error: {' '.join(str(error).split())}{near}", file=sys.stderr)
+    print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
     return 2 if isinstance(error, ConfigError) else 1
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -22,8 +22,8 @@ from dtsa_bench.drawing.style import (
     ON_LIGHT,
     PAPER,
     QUIET,
+    add_legend,
     colours,
-    legend_above,
     panels,
     style,
 )
@@ -61,13 +61,13 @@ def _whiskers(points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.nan_to_num(np.maximum(np.stack((value - low, high - value)), 0.0))
 
 
-def bars(table: SweepTable, spec: Spec) -> Figure:
+def bars(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> Figure:
     """Grouped bars: a panel a measure, a group for each level of ``x``, a bar for each of ``series``."""
     measures, xs = list(spec["y"]), table.levels(spec["x"])
     series = table.levels(spec["series"]) if "series" in spec else [None]
     shades = colours(xs if series == [None] else series)
     wide = max(3.3, 0.42 * len(xs) * len(series) + 1.2)
-    figure, axes = panels(len(measures), width=wide)
+    figure, axes = panels(len(measures), width=wide, given=given)
     handles: list[Any] = []
     for axis, measure in zip(axes, measures, strict=True):
         width = 0.8 / len(series)
@@ -81,7 +81,7 @@ def bars(table: SweepTable, spec: Spec) -> Figure:
             if axis is axes[0]:
                 handles.append(drawn)
         _dress(axis, spec, measure, xs)
-    legend_above(figure, handles, series)
+    add_legend(axes, handles, series, above=given is None)
     return figure
 
 
@@ -109,14 +109,14 @@ def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
         axis.yaxis.set_major_formatter(PercentFormatter(1.0))
 
 
-def lines(table: SweepTable, spec: Spec) -> Figure:
+def lines(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> Figure:
     """A line for each of ``series`` over the numbers of ``x``; a panel for each of ``facets`` and measure."""
     facets = table.levels(spec["facets"]) if "facets" in spec else [None]
     series = table.levels(spec["series"]) if "series" in spec else [None]
     xs = table.levels(spec["x"])
     shades = colours(series)
     shown = [(facet, measure) for measure in spec["y"] for facet in facets]
-    figure, axes = panels(len(shown), width=4.6, height=3.3, columns=2)
+    figure, axes = panels(len(shown), width=4.6, height=3.3, columns=2, given=given)
     handles: list[Any] = []
     for axis, (facet, measure) in zip(axes, shown, strict=True):
         for number, name in enumerate(series):
@@ -147,7 +147,7 @@ def lines(table: SweepTable, spec: Spec) -> Figure:
             axis.yaxis.set_major_formatter(PercentFormatter(1.0))
         if measure in spec.get("log", ()):
             _logarithmic(axis)
-    legend_above(figure, handles, series)
+    add_legend(axes, handles, series, above=given is None)
     return figure
 
 
@@ -164,7 +164,7 @@ def _facet(axis: str, value: object) -> str:
     return f"{value} ms slots" if axis == "slot_ms" else str(value)
 
 
-def matrix(table: SweepTable, spec: Spec) -> Figure:
+def matrix(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> Figure:
     """A coloured cell with its number for each of ``rows`` and ``columns``; a panel for each of ``facets``."""
     facets = table.levels(spec["facets"]) if "facets" in spec else [None]
     rows, columns, measure = table.levels(spec["rows"]), table.levels(spec["columns"]), spec["y"][0]
@@ -175,6 +175,7 @@ def matrix(table: SweepTable, spec: Spec) -> Figure:
         width=1.5 + 0.075 * longest + wide * len(columns),
         height=1.05 + 0.36 * len(rows),
         columns=2,
+        given=given,
     )
     finite = [value for group in table.flown if math.isfinite(value := group.point(measure)[0])]
     top = 1.0 if measure == CRASHED else max(finite, default=1.0)

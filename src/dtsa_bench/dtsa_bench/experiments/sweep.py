@@ -10,11 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import UNKNOWN, ConfigError
 from dtsa_agent.core.plugins.entry_points import plug_ins_named
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.settings.declaration import Settings, check, setting, settings_of
+from dtsa_agent.core.settings.declaration import Setting, Settings, check, setting, settings_of
 from dtsa_agent.yaml_file import read_yaml
 from dtsa_bench.runs.config import FROM_SWARM, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig, MeasuredLosses
@@ -39,10 +39,10 @@ RESERVED = frozenset(
     ("key", "cell", "summary", "runs", "timed_out", "left_out", "crashed", "wasted_share", *COMMON, *VALUES)
 )
 # Settings by section. Those of the channel that follow from the swarm's are left out.
-_SECTIONS = {
-    "swarm": tuple(spec.name for spec in settings_of(SwarmConfig)),
-    "channel": tuple(spec.name for spec in settings_of(ChannelConfig) if spec.name not in FROM_SWARM),
-    "limits": tuple(spec.name for spec in settings_of(RunLimits)),
+_SECTIONS: dict[str, dict[str, Setting]] = {
+    "swarm": {spec.name: spec for spec in settings_of(SwarmConfig)},
+    "channel": {spec.name: spec for spec in settings_of(ChannelConfig) if spec.name not in FROM_SWARM},
+    "limits": {spec.name: spec for spec in settings_of(RunLimits)},
 }
 
 
@@ -149,11 +149,16 @@ def run_config(settings: Mapping[str, Any]) -> RunConfig:
     for name, value in settings.items():
         section = section_of(name)
         if section is None:
-            raise ConfigError(name, value, "one of the settings " + ", ".join(sum(_SECTIONS.values(), ())))
+            raise ConfigError(name, value, UNKNOWN + ", ".join(setting_specs()))
         parts[section][name] = value
     swarm = SwarmConfig.from_dict(parts["swarm"])
     channel = {**from_swarm(swarm), **parts["channel"]}
     return RunConfig(swarm, ChannelConfig.from_dict(channel), RunLimits(**parts["limits"]))
+
+
+def setting_specs() -> dict[str, Setting]:
+    """Return the settings of a run by their flat names."""
+    return {name: spec for section in _SECTIONS.values() for name, spec in section.items()}
 
 
 def section_of(name: str) -> str | None:

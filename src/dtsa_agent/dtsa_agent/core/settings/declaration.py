@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from dtsa_agent.core.errors import ConfigError, range_text
+from dtsa_agent.core.errors import UNKNOWN, ConfigError, range_text
 
 #: The default of a setting that has none.
 REQUIRED: Any = dataclasses.MISSING
@@ -231,7 +231,7 @@ def build(cls: type[T], values: Mapping[str, Any]) -> T:
     given = dict(names_with_values(values, "settings"))
     for name, value in given.items():
         if name not in known:
-            raise ConfigError(str(name), value, "one of the settings " + ", ".join(known))
+            raise ConfigError(str(name), value, UNKNOWN + ", ".join(known))
         section = known[name].section
         if section and isinstance(value, Mapping):
             with named(name):
