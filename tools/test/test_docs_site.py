@@ -15,6 +15,7 @@ import pytest
 
 pytest.importorskip("mkdocs")
 
+from browser_helpers import CHROMIUM, MISSING, browsing
 from dtsa_dev.registry import main
 
 from dtsa_agent.core.settings.config import SwarmConfig
@@ -55,6 +56,17 @@ def test_a_page_is_found_in_two_clicks_and_needs_no_network(site: Path) -> None:
         assert not loaded, f"{path.relative_to(site)} loads {loaded}"
         # For this class the theme fetches a script from elsewhere.
         assert 'class="mermaid"' not in text, path.relative_to(site)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+def test_a_page_that_is_opened_from_the_disk_is_searched(site: Path) -> None:
+    with browsing() as browser:
+        browser.open((site / "how-to" / "fly.html").as_uri())
+        field = "document.querySelector('input[name=query]')"
+        browser.wait_for(field)
+        browser.run(f"{field}.focus(), {field}.value = 'genie', {field}.dispatchEvent(new KeyboardEvent('keyup'))")
+        browser.wait_for("[...document.querySelectorAll('.md-search-result__item')].some(x => /genie/i.test(x.innerText))")
+        assert not browser.complaints()
 
 
 def test_pages_and_tables_are_made_from_the_code(site: Path) -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         RemoteProtocolError,
         SlotOutcome,
         SwarmConfig,
+        plug_in_random,
     )
     from dtsa_agent.core.plugins.table import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
@@ -74,6 +75,7 @@ __all__ = [
     "plot_lines",
     "plot_matrix",
     "plot_trajectories",
+    "plug_in_random",
     "register",
     "run_config",
     "simulate",
@@ -88,7 +90,7 @@ _HOMES = {
     "dtsa._sweep": ("SweepResult", "sweep"),
     "dtsa_agent.core": (
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "PluginError", "RemoteProtocolError",
-        "SlotOutcome", "SwarmConfig",
+        "SlotOutcome", "SwarmConfig", "plug_in_random",
     ),
     "dtsa_agent.core.plugins.entry_points": ("Table",),
     "dtsa_agent.core.registry": ("REASONS",),

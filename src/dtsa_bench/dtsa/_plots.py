@@ -1,7 +1,7 @@
 """Figures. Each function returns a `matplotlib.figure.Figure`; nothing is shown or saved.
 
-In a notebook a cell that ends with a figure shows it. `ax` draws into axes of a figure of your own: one axes, or as many
-as the figure has panels.
+In a notebook a cell that ends with a figure shows it. `ax` draws into axes of a figure of your own: one axes, or as
+many as the figure has panels.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ _GROUPS = {
     "One flight": ("simulate", "run_config", "FlightLog"),
     "Many flights": ("sweep", "SweepResult"),
     "Recorded runs": ("open", "verify", "Verification", "Difference"),
-    "What a plug-in is given": ("register", "Table"),
+    "What a plug-in is given": ("register", "Table", "plug_in_random"),
     "Figures": (*(name for name in dtsa.__all__ if name.startswith("plot_")), "agent_colour"),
     "One agent, one channel": ("Agent", "Decision", "SlotOutcome", "Channel", "Verdict"),
     "Settings": _SETTINGS,

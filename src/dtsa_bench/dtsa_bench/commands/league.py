@@ -143,7 +143,7 @@ def _check(args: argparse.Namespace, the_league: League) -> int:
 
 def _table(args: argparse.Namespace, the_league: League) -> int:
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.experiments.league import HEADS, LeagueTable, read_entries
+    from dtsa_bench.experiments.league import HEADS, STAR, LeagueTable, read_entries
     from dtsa_bench.experiments.tables import aligned
     from dtsa_bench.pages.report.tables import write_league
 
@@ -157,6 +157,6 @@ def _table(args: argparse.Namespace, the_league: League) -> int:
     if args.json:
         print(json.dumps([dict(zip(HEADS, line, strict=True)) for line in table.lines("-")], indent=1))
     else:
-        print(aligned([HEADS, *table.lines("-")]))
+        print(f"{aligned([HEADS, *table.lines('-')])}\n{STAR}")
         print(f"table: {page}")
     return 0

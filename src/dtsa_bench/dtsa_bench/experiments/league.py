@@ -42,6 +42,8 @@ SCHEME_SETTINGS = (
     "policy", "frame", "options", "gossip", "epsilon", "selection", "boot_round", "age_cap", "return_every",
     "anchor_every", "anchor_rest", "open_every", "adoption", "depth_rate", "lease_share",
 )  # fmt: skip
+#: Below a table: what the star at a rank means.
+STAR = "* Flown by looking into all agents, in place of what a radio would have to tell."
 HEADS = ("rank", "scheme", "lost", "crashed", "out of time", "age, ms", "on the air", "worst cell")
 _SHORTEST, _STEP_NS = "shortest", 10_000  # slots as short as the frames allow, rounded up
 _LEAST_AGE_MS = 0.01  # smaller ages count as this one: their logarithm is taken
@@ -316,7 +318,7 @@ class LeagueTable:
             not_flown = f" + {total.failed} not flown" if total.failed else ""
             lines.append(
                 [
-                    "bound" if entry["bound"] else str(rank),
+                    "bound" if entry["bound"] else f"{rank}*" if _sees_everything(entry) else str(rank),
                     entry["name"],
                     f"{count} ({percent})",
                     str(total.crashed),
@@ -341,6 +343,13 @@ class LeagueTable:
             ]
             for entry, cells in zip(self.entries, self.by_cell, strict=True)
         ]
+
+
+def _sees_everything(entry: Entry) -> bool:
+    """Whether the simulator flies the entry by looking into all agents; unknown plug-ins do not count."""
+    policy = entry["scheme"]["policy"]
+    here = policy in POLICIES.rows or policy in POLICIES.plug_in_names()
+    return here and POLICIES.row(policy).needs_everybody
 
 
 def percent_text(share: float) -> str:

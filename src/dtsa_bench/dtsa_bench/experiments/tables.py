@@ -257,7 +257,9 @@ def table_text(table: SweepTable, width: int = 0, shown: Sequence[str] = SHOWN, 
             parts[-1] += block
         else:
             parts.append([*labels, *block])
-    return "\n\n".join(aligned(list(zip(*part, strict=True))) for part in parts)
+    heads = [f"{MEASURES[name].head}: {label_of(name)}" for name in table.known(shown) if MEASURES[name].head]
+    legend = "; ".join(["out: flights that did not end as they should, left out of distances and times", *heads])
+    return "\n\n".join([*(aligned(list(zip(*part, strict=True))) for part in parts), legend])
 
 
 def table_html(table: SweepTable, shown: Sequence[str] = SHOWN, most: int | None = None) -> str:

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from dtsa_bench.drawing.style import save, themed
 from dtsa_bench.experiments.charts import draw, league_scores
-from dtsa_bench.experiments.league import HEADS, LeagueTable
+from dtsa_bench.experiments.league import HEADS, STAR, LeagueTable
 from dtsa_bench.experiments.statistics import LEVEL, wilson
 from dtsa_bench.experiments.tables import CRASHED, SweepTable, label_of
 from dtsa_bench.pages.html import render_page, write_page
@@ -138,4 +138,5 @@ _LEAGUE_NOTES = (
     "flight, ten rounds of TDMA. So schemes that lose their hardest flights gain nothing by it.",
     "Rank: by lost flights times age. Whether the flights are right, “league check” says.",
     "A bound looks into all agents. Nobody can fly it.",
+    STAR,
 )
