@@ -10,12 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dtsa_agent.core.errors import DtsaError
+from dtsa_bench.commands.registry import Command
 from dtsa_dev.proofs.library import HERE, LIBRARY, compile_program, sources, tool
 
-DESCRIPTION = """\
-Runs libdtsa's own code for policy lease through the states that two or three agents can reach, for all patterns of
-loss, and checks the protocol's invariants in each; then breaks one rule at a time and sees that the search finds it."""
-EXAMPLES = (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only"))
 _SPEED = "-O2"
 ANY = -1  # any number of times
 # Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody, also when it is
@@ -158,27 +155,31 @@ MUTANTS = (
 )  # fmt: skip
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    parser.add_argument("--mutants", action="store_true", help="the broken rules only")
+class ProveCommand(Command):
+    description = """\
+Runs libdtsa's own code for policy lease through the states that two or three agents can reach, for all patterns of
+loss, and checks the protocol's invariants in each; then breaks one rule at a time and sees that the search finds it."""
+    examples = (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only"))
 
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--mutants", action="store_true", help="the broken rules only")
 
-def run(args: argparse.Namespace) -> int:
-    """Explore."""
-    import tempfile
+    def run(self, args: argparse.Namespace) -> int:
+        """Explore."""
+        import tempfile
 
-    failed = 0
-    with tempfile.TemporaryDirectory() as directory:
-        for world in () if args.mutants else WORLDS:
-            found = explore(build(Path(directory), relay_reach=world.relay_reach), world)
-            failed += bool(found.broken)
-            end = found.broken or ("all states" if found.closed else "holds so far, not all states")
-            print(f"{world.name:62} {found.states:9} states, depth {found.depth:3}: {end}", flush=True)
-        for mutant in MUTANTS:
-            found = explore(build(Path(directory), mutant), mutant.world)
-            failed += not found.broken
-            print(f"without {mutant.rule!r}: {found.broken or 'NOT FOUND'}; {found.states} states", flush=True)
-    return 1 if failed else 0
+        failed = 0
+        with tempfile.TemporaryDirectory() as directory:
+            for world in () if args.mutants else WORLDS:
+                found = explore(build(Path(directory), relay_reach=world.relay_reach), world)
+                failed += bool(found.broken)
+                end = found.broken or ("all states" if found.closed else "holds so far, not all states")
+                print(f"{world.name:62} {found.states:9} states, depth {found.depth:3}: {end}", flush=True)
+            for mutant in MUTANTS:
+                found = explore(build(Path(directory), mutant), mutant.world)
+                failed += not found.broken
+                print(f"without {mutant.rule!r}: {found.broken or 'NOT FOUND'}; {found.states} states", flush=True)
+        return 1 if failed else 0
 
 
 def build(directory: Path, mutant: Mutant | None = None, relay_reach: int = 24) -> Path:

@@ -18,7 +18,7 @@ def add_commands() -> None:
     """Make these commands known to the command line of `dtsa_bench`."""
     from dtsa_bench.commands import registry
 
-    registry.add("dtsa_dev", COMMANDS)
+    registry.add_commands("dtsa_dev", COMMANDS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

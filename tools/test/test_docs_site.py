@@ -65,7 +65,9 @@ def test_a_page_that_is_opened_from_the_disk_is_searched(site: Path) -> None:
         field = "document.querySelector('input[name=query]')"
         browser.wait_for(field)
         browser.run(f"{field}.focus(), {field}.value = 'genie', {field}.dispatchEvent(new KeyboardEvent('keyup'))")
-        browser.wait_for("[...document.querySelectorAll('.md-search-result__item')].some(x => /genie/i.test(x.innerText))")
+        browser.wait_for(
+            "[...document.querySelectorAll('.md-search-result__item')].some(x => /genie/i.test(x.innerText))"
+        )
         assert not browser.complaints()
 
 

@@ -53,10 +53,11 @@ def commands() -> str:
 
 
 def _command(name: str, text: str) -> str:
-    whole, module = cli.build_parser(name)
+    whole, command = cli.build_parser(name)
+    assert command is not None
     parser = whole.commands[name]
     parts = [f"## {name}\n\n{parser.description or text}\n\n"]
-    lines = [f"dtsa {name} {words}".rstrip() + f"    # {what}\n" for words, what in module.EXAMPLES]
+    lines = [f"dtsa {name} {words}".rstrip() + f"    # {what}\n" for words, what in command.examples]
     parts += ["```sh\n", *lines, "```\n\n"] if lines else []
     for group in parser._action_groups:
         rows = [_argument(parser, action) for action in group._group_actions if action.help != argparse.SUPPRESS]

@@ -1,29 +1,36 @@
-"""Options of agents, and of those that listen to them, on a network: what carries the frames, and what all share.
-
-With `--swarm FILE` the settings that all computers of a swarm share stand in a YAML file in the place of options.
-"""
+"""`dtsa agent` and `dtsa sniff`: agents whose frames go over a network or a radio; the options that they share."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import sys
 from collections.abc import Mapping
 from typing import Any
 
+from dtsa_agent.air.datagram import check_fits
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import AIRS, settings_class
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting, Settings, names_with_values, settings_of
+from dtsa_agent.core.station import check_joinable
 from dtsa_agent.keys import check_key, check_session
 from dtsa_agent.yaml_file import read_yaml
-from dtsa_bench.runs.options import add_options, given
+from dtsa_bench.runs.options import add_options, given, number
 
-from .registry import hint
+from .registry import Command, hint
 
 DEFAULT_POLICY = "lease"
+
+
 _NO_OPTION = ("policy", "auth", *(s.name for s in settings_of(SwarmConfig) if s.group == "Priority and selection"))
+
+
 _ROS = "/**", "ros__parameters"  # of a file of ROS parameters, which counts as well
+
+
 _OPTIONS = {"policy": "policy", "auth": "seal"}  # settings whose options are called otherwise
 
 
@@ -113,3 +120,86 @@ def _content(path: str) -> dict[str, Any]:
         if isinstance(content, Mapping) and section in content:
             content = content[section]
     return dict(names_with_values(content, f"swarm {path}"))
+
+
+class AgentCommand(Command):
+    description = """\
+Flies one agent, with a simulated vehicle, whose frames go over a port (--air): one process a computer, no channel
+node, no start signal, no ROS. The first agent begins; groups that meet become one. Frames are sealed: the key is in the
+environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
+    examples = (
+        ("--id 3 --interface eth0 --auth-session 41", "the third of twelve; the key is in DTSA_AUTH_KEY"),
+        ("--id 1 --agents 4 --interface lo --no-seal --duration-s 10 --out runs/cf1", "ten seconds, with a bag"),
+        ("--swarm swarm.yaml --id 3 --auth-session 40 --check", "before a flight: do all hear all"),
+        ("--id 3 --air crazyradio --uri radio://0/80/2M --slot-ms 20 --auth-session 41", "by a Crazyradio 2.0"),
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.usage = "%(prog)s --id N (--interface NAME | --device PATH | --uri URI) [OPTIONS]"
+        add_results(parser)
+        own = parser.add_argument_group("this agent")
+        add_options(own, AgentSettings, "own")
+        own.add_argument(
+            "--check",
+            nargs="?",
+            const="0",
+            metavar="SECONDS",
+            help="does not fly: tells who is heard, in time, and by whom; exit code 0: all hear all [until all know]",
+        )
+        add_network_options(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Fly until Ctrl-C, and print what came of it."""
+        from dtsa_bench.network.flying import AgentJob, check, fly
+
+        port, config = read_network_options(args)
+        own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
+        check_joinable(config.policy)  # before anything is made
+        check_fits(config, port.properties)
+        job = AgentJob(own, config, port, args.out, args.json)
+        return fly(job) if args.check is None else check(job, number(args.check, "check", 0, 3600))
+
+
+class SniffCommand(Command):
+    description = """\
+Listens to a swarm on a network or a radio without taking part, records what it hears, and judges it: two senders in a
+slot, frames out of turn, turns given away twice or by others. Exit code 1 if a rule was broken. A listener may miss
+frames: then a lease that it does not know looks like a broken rule."""
+    examples = (
+        ("--interface eth0 --auth-session 41 --out runs/sniffed", "twelve agents; until Ctrl-C"),
+        ("--air crazyradio --uri radio://0/80/2M --slot-ms 20 --auth-session 41", "with a Crazyradio 2.0"),
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.usage = "%(prog)s (--interface NAME | --device PATH | --uri URI) [OPTIONS]"
+        add_results(parser)
+        parser.add_argument("--duration-s", metavar="X", default="0", help="for so long; 0: until Ctrl-C [0]")
+        add_network_options(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Listen until Ctrl-C, and print what came of it."""
+        from dtsa_agent.stop import Stop
+        from dtsa_bench.log.bag.errors import BagError
+        from dtsa_bench.network.sniffer import Sniffer
+        from dtsa_bench.runs.options import new_directory, number
+
+        from .recordings import summary_lines
+
+        port, config = read_network_options(args)
+        duration = number(args.duration_s, "duration_s", 0, 1e6)
+        directory = None if args.out is None else new_directory(args.out)
+        path = None if directory is None else directory / "sniffed.mcap"
+
+        def say(line: str) -> None:
+            print(f"dtsa: {line}", file=sys.stderr, flush=True)
+
+        with Stop() as stop, Sniffer(config, port, path, say) as sniffer:
+            sniffer.run(stop, duration)
+        summary = sniffer.summary()
+        text = json.dumps(summary, indent=2) + "\n"
+        if directory is not None:
+            (directory / "summary.json").write_text(text, encoding="utf-8")
+        print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
+        if sniffer.bag is not None and sniffer.bag.failure:
+            raise BagError(sniffer.bag.failure)
+        return 1 if summary["rules_broken"] else 0
