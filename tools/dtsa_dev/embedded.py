@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.commands.registry import Command
-from dtsa_dev.proofs.library import HERE, LIBRARY, compile_program, sources, tool
+from dtsa_dev.proofs.programs import HERE, LIBRARY, compile_program, sources, tool
 
 CALLS = ("slot", "command", "hear", "end")  # in the order of meter.h
 TURNS = ("hear", "decide", "send", "steer", "slot", "awake")  # of the app, in the order of board_cost.c
@@ -43,7 +43,7 @@ class EmbeddedFlight:
 
 
 @dataclass(frozen=True, slots=True)
-class BoardCost:
+class BoardCosts:
     """What one policy costs the app; instructions by kind of turn: mean, most."""
 
     policy: str
@@ -151,7 +151,7 @@ def fly_on_cortex(
     return _read_flights(_run_on_cortex(directory, [HERE / "flight.c", *sources()], flags, metered))
 
 
-def fly_app_on_cortex(directory: Path, slots: int = 200, sample: bool = False) -> list[BoardCost]:
+def fly_app_on_cortex(directory: Path, slots: int = 200, sample: bool = False) -> list[BoardCosts]:
     """The app's loop there, with 12 agents and with as many as it is made for.
 
     :param slots: of each flight, from when the app steers.
@@ -171,7 +171,7 @@ def fly_app_on_cortex(directory: Path, slots: int = 200, sample: bool = False) -
         policy, *words = line.split()
         agents, counted, stack, *values = map(int, words)
         pairs = {kind: (values[2 * i], values[2 * i + 1]) for i, kind in enumerate(TURNS)}
-        costs.append(BoardCost(policy, agents, counted, stack + frame, pairs, values[-1]))
+        costs.append(BoardCosts(policy, agents, counted, stack + frame, pairs, values[-1]))
     return costs
 
 

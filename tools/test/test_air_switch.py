@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dtsa_dev.network.hosts import Host, hosts, why_not
+from dtsa_dev.network.hosts import EmulatedHost, hosts, why_not
 from dtsa_dev.network.switch import Intruder, Links, Switch
 from trials import Trial, TrialError, flight_time, under_way
 
@@ -52,7 +52,7 @@ class Cables:
         self.pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(3)]
         for end in (end for pair in self.pairs for end in pair):
             end.setblocking(False)
-        joined = [Host(k + 1, "", pair[0].fileno(), -1) for k, pair in enumerate(self.pairs)]
+        joined = [EmulatedHost(k + 1, "", pair[0].fileno(), -1) for k, pair in enumerate(self.pairs)]
         self.switch = Switch(joined, GROUP, ChannelConfig(agents=3, link_delay_ns=0, **channel), links)
 
     def send(self, host: int, data: bytes) -> None:

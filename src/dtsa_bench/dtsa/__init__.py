@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         SwarmConfig,
         plug_in_random,
     )
-    from dtsa_agent.core.plugins.table import Table
+    from dtsa_agent.core.plugins.kinds import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
     from dtsa_bench.drawing.palette import agent_colour
     from dtsa_bench.log.bag.errors import BagError, UnusableBag
@@ -36,9 +36,8 @@ if TYPE_CHECKING:
     from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig, Verdict
 
     from . import env
-    from ._flights import open, run_config, simulate, verify
+    from ._flights import open, register, run_config, simulate, verify
     from ._plots import plot_ages, plot_bars, plot_distances, plot_lines, plot_matrix, plot_trajectories
-    from ._plugins import register
     from ._sweep import SweepResult, sweep
 
 __all__ = [
@@ -84,9 +83,8 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "dtsa._flights": ("open", "run_config", "simulate", "verify"),
+    "dtsa._flights": ("open", "register", "run_config", "simulate", "verify"),
     "dtsa._plots": ("plot_ages", "plot_bars", "plot_distances", "plot_lines", "plot_matrix", "plot_trajectories"),
-    "dtsa._plugins": ("register",),
     "dtsa._sweep": ("SweepResult", "sweep"),
     "dtsa_agent.core": (
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "PluginError", "RemoteProtocolError",

@@ -15,7 +15,7 @@ from dtsa_bench.experiments.provenance import code_digest
 from dtsa_bench.experiments.sweep import Sweep, load_preset, make_sweep
 from dtsa_bench.experiments.tables import SweepTable, table_html, table_text, write_results
 
-from ._plugins import registered
+from ._flights import registered
 
 if TYPE_CHECKING:
     import pandas as pd

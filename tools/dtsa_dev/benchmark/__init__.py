@@ -17,7 +17,7 @@ PARTS = {"kernels": "core", "slots": "core", "flights": "core", "nodes": "nodes"
 HEADS = ("what", "here", "beside it", "ratio", "target")
 
 
-class Row(NamedTuple):
+class Measurement(NamedTuple):
     """One measurement."""
 
     what: str
@@ -59,10 +59,10 @@ runs on it; the ratios much less. A ratio is our time over the other one: smalle
                 f"benchmark: the machine is busy (load {before}, {cores} cores): times will be too long",
                 file=sys.stderr,
             )
-        rows: list[Row] = []
+        rows: list[Measurement] = []
         for name in chosen:
             print(f"benchmark: {name} ...", file=sys.stderr)
-            measure: Callable[[], Iterator[Row]] = getattr(
+            measure: Callable[[], Iterator[Measurement]] = getattr(
                 importlib.import_module(f"dtsa_dev.benchmark.{PARTS[name]}"), name
             )
             for row in measure():

@@ -48,13 +48,13 @@ def filled(text: str) -> str:
             return evidence(name.removeprefix("evidence "))
         if name not in TABLES:
             raise ConfigError("table", name, ", ".join(TABLES))
-        return _made(name)
+        return _table_of(name)
 
     return _PLACE.sub(fill, text)
 
 
 @cache  # `docs --serve` builds the site again and again
-def _made(name: str) -> str:
+def _table_of(name: str) -> str:
     return TABLES[name]()
 
 

@@ -56,7 +56,7 @@ class FakeModemSettings:
 
 
 @dataclass(slots=True)
-class _One:
+class _FakeModem:
     """One modem."""
 
     master: int = -1  # of its pseudo terminal; -1: it is unplugged
@@ -81,7 +81,7 @@ class FakeModems:
         self._byte_ns = _BITS * _SECOND // settings.line_baud
         self._channel, self._began_ns = Channel(channel), time.monotonic_ns()
         self._draw = random.Random(channel.seed)
-        self._ones = [_One() for _ in range(settings.count)]
+        self._ones = [_FakeModem() for _ in range(settings.count)]
         #: Paths of the devices.
         self.devices = [directory / f"modem{number}" for number in range(1, settings.count + 1)]
         self._events: list[tuple[int, int, int, int, bytes]] = []  # a heap: ns, entry, kind, modem, bytes
@@ -211,7 +211,7 @@ class FakeModems:
         one.last_ns = max(one.last_ns, now_ns) + len(data) * self._byte_ns
         self._plan(index, now_ns)
 
-    def _wrong_speed(self, one: _One) -> bool:
+    def _wrong_speed(self, one: _FakeModem) -> bool:
         """Whether the program has set another speed than the modem's."""
         with suppress(termios.error):
             speed: int = termios.tcgetattr(one.slave)[5]

@@ -19,7 +19,7 @@ FAR = 1e6  # m, a goal that nobody reaches: the agent has something to say for a
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class FlightEvent:
     """Something that happens to an agent before a slot begins.
 
     ``kind``: ``go`` (gets a goal), ``stop`` (its goal is where it is), ``join``, ``leave`` (says so in its next turn),
@@ -102,7 +102,7 @@ class Experiment:
         *,
         movers: Iterable[int] = (),
         absent: Iterable[int] = (),
-        events: Sequence[Event] = (),
+        events: Sequence[FlightEvent] = (),
         final: bool = True,
         warmup: int = 0,
         shared: bool = False,
@@ -120,7 +120,7 @@ class Experiment:
         self.outcome = Outcome()
         self.slot = 0
         self._waiting: list[Wait] = []
-        self._events: dict[int, list[Event]] = {}
+        self._events: dict[int, list[FlightEvent]] = {}
         for event in events:
             self._events.setdefault(event.slot, []).append(event)
         if config.policy_row.agent_state:
@@ -138,7 +138,7 @@ class Experiment:
         self.moving[agent - 1] = True
         self.moving_since[agent - 1] = self.slot
 
-    def happen(self, event: Event) -> None:
+    def happen(self, event: FlightEvent) -> None:
         """Lets an event happen now."""
         swarm, k = self.swarm, event.agent - 1
         if event.kind == "go" and not self.moving[k]:
@@ -162,7 +162,7 @@ class Experiment:
             self._waiting = [wait for wait in self._waiting if wait.agent != event.agent]
             self._wait(event)
 
-    def _wait(self, event: Event) -> None:
+    def _wait(self, event: FlightEvent) -> None:
         wait = Wait(event.agent, event.kind, self.slot)
         self._waiting.append(wait)
         self.outcome.waits.append(wait)
@@ -199,7 +199,7 @@ class Experiment:
         if slot >= self.warmup:
             self._ages()
         if self._waiting:
-            self._look_at_waiting(ids if len(ids) == 1 else ())
+            self._check_waiting(ids if len(ids) == 1 else ())
         self.slot += 1
         return ids
 
@@ -226,7 +226,7 @@ class Experiment:
         out.true_sum += int((self.slot - since)[heard].sum())
         out.true_count += int(np.count_nonzero(heard))
 
-    def _look_at_waiting(self, ids: tuple[int, ...]) -> None:
+    def _check_waiting(self, ids: tuple[int, ...]) -> None:
         swarm = self.swarm
         for wait in self._waiting:
             if wait.first < 0 and wait.agent in ids:

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from typing import Any
 
-from dtsa_agent.core.agents.delays import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.station import STATES
 
 _ON_TIME_NS = 1_000_000

@@ -157,12 +157,13 @@ class StationSettings:
         lease = {"anchor_every": config.anchor_every, "main_every": config.main_every, "open_every": config.open_period}
         cycle = lib.dtsa_slot_cycle(ffi.new("dtsa_config *", {"agents": config.agents, "lease": lease}))
         self.c = ffi.new("dtsa_station_settings *", {
-            "id": id, "agents": config.agents, "anchor_every": config.heard_every,
-            "main_every": config.main_every if rests else config.heard_every, "slot_cycle": cycle,
+            "id": id, "agents": config.agents, "anchor_every": config.turn_every,
+            "main_every": config.main_every if rests else config.turn_every, "slot_cycle": cycle,
             "extended": config.extended, "own_bytes": config.own_bytes,
             "frame_length": config.frame_length - (TAG_LENGTH if config.auth else 0),
             "position_step": position_step(config.extent_m), "slot_ns": config.slot_ns, "seed": config.seed,
-            "sends": lib.DTSA_SENDS_IN_ANCHORS if config.policy_row.extended else by_chance, "quorum": number, "quorum_share": share,
+            "sends": lib.DTSA_SENDS_IN_ANCHORS if config.policy_row.extended else by_chance,
+            "quorum": number, "quorum_share": share,
             "key": self._key if key else ffi.NULL, "key_length": len(key), "session": session,
             "early_count": EARLY_COUNT, "begins": begins, "origin_ns": origin_ns or 0,
             "keeps_time": keeps_time, "equal_tables": not config.policy_row.may_join,

@@ -113,7 +113,7 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
 
             flight = fly(config, directory, options, stop, on_domain=show)
             interrupted = bool(stop)
-            _tell(args, flight)
+            _print_result(args, flight)
             picture = directory / "trajectories.png"
             if not args.json and picture.exists():
                 print(f"picture: {picture}", flush=True)
@@ -126,11 +126,11 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
         cut_short = flight.summary.get("cut_short")
         if interrupted:
             print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
-            _unheard(flight.summary)
+            _report_missing_frames(flight.summary)
             return INTERRUPTED
         if cut_short:
             print(f"dtsa: the flight was cut short: {cut_short}", file=sys.stderr)
-        return 1 if _unheard(flight.summary) or cut_short else 0
+        return 1 if _report_missing_frames(flight.summary) or cut_short else 0
 
 
 INTERRUPTED = 130
@@ -212,8 +212,8 @@ def run_crazyflies(args: argparse.Namespace) -> int:
         flight, cut_short = fly_crazyflies(
             config, settings, path, args.out, options, stop, attach=args.attach, page=page
         )
-    _tell(args, flight)
-    unheard = _unheard(flight.summary)
+    _print_result(args, flight)
+    unheard = _report_missing_frames(flight.summary)
     not_landed = [] if stop and not cut_short else flight.summary.get("not_landed", [])
     if problem := mission_problem(cut_short, not_landed):
         print(f"dtsa: {problem}", file=sys.stderr)
@@ -233,14 +233,14 @@ def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
     return f"{exchange}; {end}"
 
 
-def _unheard(summary: dict[str, Any]) -> bool:
+def _report_missing_frames(summary: dict[str, Any]) -> bool:
     """Says so if nobody has heard anybody, or most frames were of no use; whether it is so."""
     if summary["unheard"]:
         print(f"dtsa: {summary['unheard']}", file=sys.stderr)
     return bool(summary["unheard"])
 
 
-def _tell(args: argparse.Namespace, flight: Any) -> None:
+def _print_result(args: argparse.Namespace, flight: Any) -> None:
     """Prints what came of a flight."""
     if args.json:
         print(json.dumps(flight.summary, indent=2))

@@ -190,10 +190,10 @@ frames: then a lease that it does not know looks like a broken rule."""
         directory = None if args.out is None else new_directory(args.out)
         path = None if directory is None else directory / "sniffed.mcap"
 
-        def say(line: str) -> None:
+        def report(line: str) -> None:
             print(f"dtsa: {line}", file=sys.stderr, flush=True)
 
-        with Stop() as stop, Sniffer(config, port, path, say) as sniffer:
+        with Stop() as stop, Sniffer(config, port, path, report) as sniffer:
             sniffer.run(stop, duration)
         summary = sniffer.summary()
         text = json.dumps(summary, indent=2) + "\n"

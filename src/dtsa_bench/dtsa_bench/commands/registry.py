@@ -68,10 +68,10 @@ class Command:
         raise NotImplementedError
 
 
-def add_commands(package: str, commands: Mapping[str, str]) -> None:
-    """Add the commands of another package, a module each, for the command line of a checkout."""
+def add_commands(commands: Mapping[str, str], modules: Mapping[str, str]) -> None:
+    """Add commands of another package, what each does and its module, for the command line of a checkout."""
     COMMANDS.update(commands)
-    _MODULES.update({name: f"{package}.{name.replace('-', '_')}" for name in commands})
+    _MODULES.update(modules)
 
 
 def load_command(name: str) -> Command:

@@ -159,7 +159,7 @@ stopped when the same command is given again. Sweeps of your own: docs/how-to/sw
         code = 0
         for sweep in sweeps:
             directory = base if args.out and len(sweeps) == 1 else base / sweep.name
-            code = max(code, _one(sweep, directory, args))
+            code = max(code, _fly_sweep(sweep, directory, args))
         return code
 
 
@@ -182,7 +182,7 @@ def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     return [spec.load_preset(name, **changes) for name in names]
 
 
-def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
+def _fly_sweep(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     from dtsa_bench.experiments.batch import FAILED, run_in
     from dtsa_bench.experiments.provenance import code_digest
     from dtsa_bench.experiments.tables import SweepTable, table_text, write_results

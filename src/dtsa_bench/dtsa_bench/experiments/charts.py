@@ -177,7 +177,7 @@ def matrix(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -
         columns=2,
         given=given,
     )
-    finite = [value for group in table.flown if math.isfinite(value := group.point(measure)[0])]
+    finite = [value for group in table.groups_with_runs if math.isfinite(value := group.point(measure)[0])]
     top = 1.0 if measure == CRASHED else max(finite, default=1.0)
     bottom = 0.0 if measure == CRASHED else min(finite, default=0.0)
     for axis, facet in zip(axes, facets, strict=True):

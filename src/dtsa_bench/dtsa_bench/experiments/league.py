@@ -25,7 +25,7 @@ from dtsa_agent.yaml_file import read_yaml
 from dtsa_bench import __version__
 
 from .batch import FAILED, Batch, Row, Task, key_of, run_all, write_whole
-from .provenance import made_with
+from .provenance import read_provenance
 from .statistics import LEVEL, Share, wilson
 from .sweep import cost_of, run_config
 from .tables import share_texts
@@ -112,7 +112,7 @@ def make_entry(the_league: League, what: str, name: str | None, changes: Mapping
         raise ConfigError("name", chosen, "lower-case letters, digits, dots and hyphens, 40 at most")
     needs_everybody = POLICIES.row(scheme["policy"]).needs_everybody
     bound = bool(own.get("bound", needs_everybody and what not in the_league.entrants))
-    made, plug_in = made_with(), POLICIES.plug_ins().get(scheme["policy"])
+    made, plug_in = read_provenance(), POLICIES.plug_ins().get(scheme["policy"])
     package = f"{plug_in.dist.name} {plug_in.dist.version}" if plug_in and plug_in.dist else f"dtsa {__version__}"
     commit = made["commit"][:9] + (" with changes" if made["tree_changed"] else "")
     described = {"package": package, "commit": commit, "date": made["date"][:10]}

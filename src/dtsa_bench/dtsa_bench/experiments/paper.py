@@ -16,7 +16,7 @@ from dtsa_bench.drawing.style import save_described
 
 from .batch import write_whole
 from .charts import draw
-from .provenance import made_with
+from .provenance import read_provenance
 from .sweep import Sweep
 from .tables import CRASHED, MEASURES, SweepTable, latex_table
 
@@ -54,7 +54,7 @@ def write_paper(table: SweepTable, directory: Path, form: str, code: str, comman
         names.append(path.name)
     # Crashes, ages, and what the sweep's figures show; of a sweep without figures, distances.
     shown = [name for spec in sweep.figures for name in spec.get("y", ())] or ["min_distance_m"]
-    measures = table.known([name for name in dict.fromkeys(("age_mean_slots", *shown)) if name in MEASURES])
+    measures = table.measured([name for name in dict.fromkeys(("age_mean_slots", *shown)) if name in MEASURES])
     write_whole(directory / "table.tex", latex_table(table, [CRASHED, *measures], comments))
     frame = table.groups_frame()
     write_whole(directory / "table.csv", frame[frame["runs"] > 0].to_csv(index=False, na_rep="nan"))
@@ -65,7 +65,7 @@ def write_paper(table: SweepTable, directory: Path, form: str, code: str, comman
 
 def _origin(table: SweepTable, code: str, command: str) -> dict[str, str]:
     """How it was made, by name."""
-    sweep, made = table.sweep, made_with()
+    sweep, made = table.sweep, read_provenance()
     changed = ", with changes" if made["tree_changed"] else ""
     return {
         "sweep": f"{sweep.name}, {len(table.rows)} flights, {len(sweep.cells)} settings",

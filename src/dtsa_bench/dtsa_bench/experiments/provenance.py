@@ -66,7 +66,7 @@ def _files_of(module: str) -> Iterator[Path]:
         yield Path(spec.origin)
 
 
-def made_with() -> dict[str, Any]:
+def read_provenance() -> dict[str, Any]:
     """Return the commit of the checkout and whether the tree differs from it; date, cores and Python."""
     ours = _git("ls-files", "--error-unmatch", Path(__file__).name)  # an installation may lie in another repository
     commit = _git("rev-parse", "HEAD") if ours else ""

@@ -154,4 +154,4 @@ def test_the_commit_of_somebody_elses_repository_is_not_ours(tmp_path: Path, mon
     for words in (["init", "-q"], ["add", "own.py"], ["commit", "-q", "-m", "own"]):
         subprocess.run([*git, *words], check=True)
     monkeypatch.setattr(provenance, "_HERE", tmp_path)
-    assert provenance.made_with()["commit"] == "unknown"
+    assert provenance.read_provenance()["commit"] == "unknown"

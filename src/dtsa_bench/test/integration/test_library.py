@@ -303,7 +303,7 @@ def run_examples(test: doctest.DocTest) -> None:
     assert not failures, "".join(failures)
 
 
-@pytest.mark.parametrize("name", ["_flights", "_plots", "_plugins", "_sweep", "env"])
+@pytest.mark.parametrize("name", ["_flights", "_plots", "_sweep", "env"])
 def test_examples_of_docstrings_run(name: str) -> None:
     if name == "env":
         pytest.importorskip("pettingzoo")

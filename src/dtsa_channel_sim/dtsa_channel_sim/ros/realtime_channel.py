@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
-from dtsa_agent.core.agents.delays import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Feed

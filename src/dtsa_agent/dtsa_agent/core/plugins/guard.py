@@ -70,7 +70,7 @@ class Guarded:
             raise PluginError(f"{self.name}, {method}", fault)
         return number
 
-    def bytes_said(self, answer: object, size: int) -> bytes:
+    def checked_bytes(self, answer: object, size: int) -> bytes:
         """What ``say`` has answered: as many bytes as it has declared."""
         if not isinstance(answer, (bytes, bytearray)) or len(answer) != size:
             given = f"{len(answer)} bytes" if isinstance(answer, (bytes, bytearray)) else shown(answer)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from .arithmetic import Vector
 
 if TYPE_CHECKING:
-    from .rules import Rules
-    from .table import Row
+    from .table import Row, Rules
 
 DECAY_STEPS = 4096  # beyond this many control periods a vehicle has settled at its command
 

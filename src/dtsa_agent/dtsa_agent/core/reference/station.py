@@ -2,7 +2,7 @@
 
 Every frame shows when its sender's slot 0 began: its *origin*. An agent has an origin of its own and moves it a little
 towards those that it hears. A frame whose origin is off by more than the link is trusted with shows another time; see
-:meth:`Station._gives_way` for whose time counts where two groups meet. An agent flies only while it hears, and is heard
+:meth:`Station._yields_to` for whose time counts where two groups meet. An agent flies only while it hears, and is heard
 by, a quorum of the others. All times are ns of the own clock; the same in C: ``libdtsa/station``.
 """
 
@@ -19,7 +19,7 @@ from typing import NamedTuple
 from .agent import Agent, Foreign, Receiver, hear, parse
 from .arithmetic import mix64
 from .frame import Refused, decode
-from .rules import EXTENDED, LEAVES, OFF, Rules
+from .table import EXTENDED, LEAVES, OFF, Rules
 
 Datagram = bytes
 Ns = int  # ns, own clock
@@ -257,7 +257,7 @@ class Station:
         size = (abs(median) + 1) // 2  # half away from zero: both directions weigh the same
         return size if median >= 0 else -size
 
-    def _gives_way(self, origin_ns: Ns, now: Ns) -> bool:
+    def _yields_to(self, origin_ns: Ns, now: Ns) -> bool:
         """Whether the time that a frame shows is taken over.
 
         That is so when most of all agents heard lately are in it; when it is the earlier one and half of them are, or
@@ -282,7 +282,7 @@ class Station:
         self.earlier_ns = now
         return now - self.earlier_since > self.patience_ns
 
-    def _take_over(self, origin_ns: Ns, now: Ns) -> None:
+    def _adopt_time(self, origin_ns: Ns, now: Ns) -> None:
         self.offsets.clear()
         self.origin_ns, self.in_step_ns, self.earlier_ns, self.state = origin_ns, now, None, JOINED
         for p in self.peers:
@@ -292,7 +292,7 @@ class Station:
         p.steady = p.heard_ns is not None and self._is_same(p.origin_ns, origin_ns)
         p.heard_ns, p.origin_ns = arrival, origin_ns
         if self.state == LISTENING:
-            self._take_over(origin_ns, arrival)
+            self._adopt_time(origin_ns, arrival)
             return RESTARTED
         apart, near = self._apart(origin_ns, self.origin_ns), self._is_near(origin_ns)
         if near:
@@ -304,11 +304,11 @@ class Station:
             return IN_STEP
         if self.settings.keeps_time:
             return IN_STEP
-        if not self._gives_way(origin_ns, arrival):
+        if not self._yields_to(origin_ns, arrival):
             if not near and p.steady:  # it has gone to another time, and hears this agent no more
                 p.near_ns = None
             return IN_STEP if near else OTHER
-        self._take_over(self.origin_ns + apart if near else origin_ns, arrival)
+        self._adopt_time(self.origin_ns + apart if near else origin_ns, arrival)
         return SHIFTED if near else RESTARTED
 
     # How long frames are under way. What i hears of j comes later by d + o_j - o_i, what j hears of i by d + o_i - o_j.
@@ -357,7 +357,7 @@ class Station:
         if not most:
             return
         p.unnamed += 1
-        hears = said_of(self.settings.id, [k for k, _ in d.names if k], most)
+        hears = names_hear(self.settings.id, [k for k, _ in d.names if k], most)
         if not hears and most == 1 and p.unnamed > CYCLES * (self.rules.agents - 1):
             hears = -1
         p.hears_us = hears or p.hears_us
@@ -554,7 +554,7 @@ class Station:
             self.agent.restart()
 
 
-def said_of(agent: int, names: Sequence[int], most: int) -> int:
+def names_hear(agent: int, names: Sequence[int], most: int) -> int:
     """Whether the sender of a list of names hears an agent: 1, -1, or 0: the list does not tell."""
     if agent in names:
         return 1

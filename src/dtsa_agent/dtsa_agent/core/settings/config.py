@@ -263,7 +263,7 @@ class SwarmConfig(Settings):
         return max(self.open_every, self.agents // 5) if self.open_every else 0
 
     @property
-    def heard_every(self) -> int:
+    def turn_every(self) -> int:
         """Rounds within which each agent that moves sends: M; 5 with policies that have no anchors."""
         return self.anchor_every if self.policy_row.probation else 5
 

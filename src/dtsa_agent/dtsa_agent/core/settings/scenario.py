@@ -55,7 +55,7 @@ class Plan:
     r_min: float  # m, closer than this an agent has arrived
 
     @property
-    def way(self) -> Array:
+    def path_length(self) -> Array:
         """Length of the straight lines from goal to goal, (N,), m."""
         points = np.concatenate((self.start[None], self.goals))
         return np.asarray(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)).sum(axis=0))
@@ -71,7 +71,7 @@ class Course:
     def __init__(self, plan: Plan, local: NDArray[np.int32]) -> None:
         self._start, self._moving, self._legs = plan.start[:, local], plan.moving[local], len(plan.goals)
         self.leg = np.full(len(local), -1, dtype=np.int64)  # index of the present goal, -1: waits for its first slot
-        self._since = self.leg.copy()  # slot of arrival at the present goal, -1: under way
+        self._since = self.leg.copy()  # slot of arrival at the present goal, -1: under lengths
         self.changed = self.leg.copy()  # slot in which that became its goal
         self.goal: Array = np.ascontiguousarray(self._start)  # (3, L) m, frame map, where each flies to now
         arrays = {
@@ -155,7 +155,7 @@ def make_scenario(config: SwarmConfig) -> Scenario:
     target, moving = places.copy(), np.zeros(count, dtype=np.bool_)
     if config.scenario == "streams":
         moving[: config.movers] = True
-        target[:, : config.movers] += _stream_way(config)
+        target[:, : config.movers] += _stream_lengths(config)
     else:
         for index in chosen[: config.movers // 2]:
             a, b = pairs[index]
@@ -253,14 +253,14 @@ def _stream_size(config: SwarmConfig) -> tuple[int, float]:
     return math.ceil(math.sqrt(half)), max(1.0, flight_model(config.avoider, config.options).spacing)
 
 
-def _stream_way(config: SwarmConfig) -> Array:
+def _stream_lengths(config: SwarmConfig) -> Array:
     """How far each mover of two crossing streams flies, (3, movers), m: one along x, the other along y."""
     rows, gap = _stream_size(config)
-    way = np.zeros((3, config.movers))
+    lengths = np.zeros((3, config.movers))
     length = 2 * ((rows + 1) * gap + 2.0)
-    way[0, : config.movers // 2] = length
-    way[1, config.movers // 2 :] = length
-    return way
+    lengths[0, : config.movers // 2] = length
+    lengths[1, config.movers // 2 :] = length
+    return lengths
 
 
 def _streams(config: SwarmConfig) -> tuple[Array, NDArray[np.int64]]:

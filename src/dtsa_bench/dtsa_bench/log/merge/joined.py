@@ -109,7 +109,7 @@ class ProcessReplay:
 
 def all_known_after(config: SwarmConfig) -> int:
     """Slots after which each agent that is there can be known to all that hear it: (M + 2) N."""
-    return (config.heard_every + 2) * config.agents
+    return (config.turn_every + 2) * config.agents
 
 
 class KnownPairs:

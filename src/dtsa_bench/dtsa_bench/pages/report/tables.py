@@ -76,11 +76,11 @@ def write_report(table: SweepTable, directory: Path, code: str, command: str = "
 
 
 def _groups(table: SweepTable) -> Part:
-    measures = table.known()
-    ends = [name for name in ("timed_out", "failed") if any(getattr(group, name) for group in table.flown)]
+    measures = table.measured()
+    ends = [name for name in ("timed_out", "failed") if any(getattr(group, name) for group in table.groups_with_runs)]
     heads = [*table.sweep.axes, "crashed", *(name.replace("_", " ") for name in ends), *map(label_of, measures)]
     rows = []
-    for group in table.flown:
+    for group in table.groups_with_runs:
         mark = Markup('<span class="bad">{}</span>' if group.crashed.count else '<span class="good">{}</span>')
         rows.append([
             *(str(group.labels[axis]) for axis in table.sweep.axes),

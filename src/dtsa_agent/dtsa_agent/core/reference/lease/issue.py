@@ -16,7 +16,7 @@ MORE = 2  # a mover hands on turns that are worth so many times as much to anoth
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class TurnAnnouncement:
     """What a frame says about turns."""
 
     c_s: int = 0
@@ -47,7 +47,9 @@ class Electorate:
         return sum(self.able)
 
 
-def say(memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leaves: bool) -> Said:
+def announce_turns(
+    memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leaves: bool
+) -> TurnAnnouncement:
     """What the agent's frame says about turns; the turns that it gives away are noted.
 
     :param velocity: of the agent, m/s.
@@ -64,7 +66,9 @@ def say(memory: Memory, self_index: int, table: Table, slot: int, velocity: Vect
     near = [turn for turn in handed if turn - slot <= RELAY_REACH]
     far = tuple(turn - slot for turn in handed if turn - slot > RELAY_REACH)
     lessee = memory.leases[handed[-1]].lessee if far else 0
-    return Said(c_s, leaving, leases, relay(memory, self_index, slot, near, own_is_said=bool(leases)), far, lessee)
+    return TurnAnnouncement(
+        c_s, leaving, leases, relay(memory, self_index, slot, near, own_is_said=bool(leases)), far, lessee
+    )
 
 
 def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
@@ -79,7 +83,7 @@ def electorate(memory: Memory, self_index: int, table: Table, slot: int, velocit
     """Who may be given a turn, and who else there is."""
     rows, agents = table.rows, range(memory.rules.agents)
     presumed = [is_presumed(memory, table, k, slot) for k in agents]
-    alive = [k == self_index or presumed[k] or memory.alive(k) for k in agents]
+    alive = [k == self_index or presumed[k] or memory.is_connected(k) for k in agents]
     moves = [sets_out(memory, table, k) if presumed[k] else rows[k].in_ap for k in agents]
     able = [alive[k] and moves[k] and not memory.quiet[k] and memory.missed[k] < MISSED for k in agents]
     able[self_index] = memory.moving
@@ -201,7 +205,7 @@ def issue(
                 lessee = OPEN
             elif who.members and (mine or not memory.deaf):
                 if foreseen == slot + 1:
-                    who.rights = look_ahead(memory, who, slot)
+                    who.rights = turns_ahead(memory, who, slot)
                 foresee(memory, who, range(foreseen, turn))
                 foreseen = turn
                 lessee = choose_lessee(memory, who, turn) + 1
@@ -211,7 +215,7 @@ def issue(
     return bytes(said).rstrip(b"\0")
 
 
-def look_ahead(memory: Memory, who: Electorate, slot: int) -> list[list[int]]:
+def turns_ahead(memory: Memory, who: Electorate, slot: int) -> list[list[int]]:
     """For each agent the slots to come in which it is known to send."""
     rights: list[list[int]] = [[] for _ in range(memory.rules.agents)]
     for turn in range(slot + 1, slot + memory.window):
@@ -273,7 +277,7 @@ def hand_on(
     if not given:
         return handed
     who = electorate(memory, self_index, table, slot, velocity, final)
-    who.rights = look_ahead(memory, who, slot)
+    who.rights = turns_ahead(memory, who, slot)
     who.last[self_index] = slot
     foreseen = slot + 1  # up to here, excluded
     heir = -1  # to whom all turns beyond the relay's reach go

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dtsa_agent.core.reference.frame_extended import OPEN
-from dtsa_agent.core.reference.rules import Rules
+from dtsa_agent.core.reference.table import Rules
 
 DEAF = 4  # more silent slots in a row than this, and an agent is presumed deaf
 MISSED = 4  # who missed so many expected turns gets no leases
@@ -85,7 +85,7 @@ class Memory:
         n = self.rules.agents
         return (slot // n + slot % n) % self.rules.main_every == 0
 
-    def alive(self, k: int) -> bool:
+    def is_connected(self, k: int) -> bool:
         """Whether an agent was heard of lately."""
         return self.heard[k] >= 0 and self.now - self.heard[k] <= self.patience(k)
 
