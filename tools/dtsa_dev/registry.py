@@ -72,10 +72,7 @@ class DocsCommand(Command):
     description = """\
 Builds the documentation as a site that needs no network. A dead link, a link to a heading that is not there, and a page
 that the navigation does not name end the build with code 1."""
-    examples = (
-        ("", "into runs/site"),
-        ("--serve", "on http://127.0.0.1:8000, built again after each change"),
-    )
+    examples = (("", "into runs/site"), ("--serve", "on http://127.0.0.1:8000, built again after each change"))
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--out", metavar="DIR", default=SITE, help=f"where the site is put [{SITE}]")

@@ -16,10 +16,7 @@ class VerifyCommand(Command):
     description = """\
 Rebuilds every agent and the channel from the recorded configuration, feeds them what they heard, and compares
 every message of the bag, byte by byte. Exit code 0: all equal; 1: a difference, which is shown."""
-    examples = (
-        ("runs/a", "one run"),
-        ("runs/a runs/b --json", "several, as JSON"),
-    )
+    examples = (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON"))
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("bag", nargs="+", help=RECORDED_RUN)
@@ -130,10 +127,7 @@ class ReportCommand(Command):
 Writes one self-contained HTML page about one recorded run, or several side by side: the flight in 3D, the slots,
 distances, ages, estimate errors, channel use, decisions and the configuration. It opens without a network, and
 prints."""
-    examples = (
-        ("runs/a", "one run"),
-        ("runs/a runs/b --out compared.html", "two side by side"),
-    )
+    examples = (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side"))
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{RECORDED_RUN}; up to 8")

@@ -89,10 +89,7 @@ def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
     axis.set_title(label_of(measure))
     crowded = any(len(str(x)) > 8 for x in xs)
     axis.set_xticks(
-        range(len(xs)),
-        [str(x) for x in xs],
-        rotation=20 if crowded else 0,
-        ha="right" if crowded else "center",
+        range(len(xs)), [str(x) for x in xs], rotation=20 if crowded else 0, ha="right" if crowded else "center"
     )
     axis.set_xlabel(AXIS_LABELS.get(spec["x"], spec["x"]))
     axis.grid(axis="x", visible=False)

@@ -337,10 +337,7 @@ class LeagueTable:
     def cell_lines(self) -> list[list[str]]:
         """Return a line an entry: of each cell age in ms, and in brackets lost flights, if any."""
         return [
-            [
-                entry["name"],
-                *(figure(s.age_ms[0]) + (f" ({s.lost})" if s.lost.count else "") for s in cells.values()),
-            ]
+            [entry["name"], *(figure(s.age_ms[0]) + (f" ({s.lost})" if s.lost.count else "") for s in cells.values())]
             for entry, cells in zip(self.entries, self.by_cell, strict=True)
         ]
 
