@@ -171,14 +171,14 @@ loss, and checks the protocol's invariants in each; then breaks one rule at a ti
         failed = 0
         with tempfile.TemporaryDirectory() as directory:
             for world in () if args.mutants else WORLDS:
-                found = explore(build(Path(directory), relay_reach=world.relay_reach), world)
-                failed += bool(found.broken)
-                end = found.broken or ("all states" if found.closed else "holds so far, not all states")
-                print(f"{world.name:62} {found.states:9} states, depth {found.depth:3}: {end}", flush=True)
+                result = explore(build(Path(directory), relay_reach=world.relay_reach), world)
+                failed += bool(result.broken)
+                end = result.broken or ("all states" if result.closed else "holds so far, not all states")
+                print(f"{world.name:62} {result.states:9} states, depth {result.depth:3}: {end}", flush=True)
             for mutant in MUTANTS:
-                found = explore(build(Path(directory), mutant), mutant.world)
-                failed += not found.broken
-                print(f"without {mutant.rule!r}: {found.broken or 'NOT FOUND'}; {found.states} states", flush=True)
+                result = explore(build(Path(directory), mutant), mutant.world)
+                failed += not result.broken
+                print(f"without {mutant.rule!r}: {result.broken or 'NOT FOUND'}; {result.states} states", flush=True)
         return 1 if failed else 0
 
 
@@ -220,7 +220,7 @@ def explore(program: Path, world: Scope, limit_s: float = 3600.0) -> Explored:
     """Explore a world, within a limit of wall-clock time."""
     command = [str(program), *world.words()]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit_s)
-    found = re.search(r"(?:broken (.*); )?states (\d+) depth (\d+)(.*)", done.stdout)
-    if found is None:
+    match = re.search(r"(?:broken (.*); )?states (\d+) depth (\d+)(.*)", done.stdout)
+    if match is None:
         raise DtsaError(f"prove: exit code {done.returncode}: {(done.stdout + done.stderr).strip()[-300:]}")
-    return Explored(world, found[1] or "", int(found[2]), int(found[3]), "closed" in found[4])
+    return Explored(world, match[1] or "", int(match[2]), int(match[3]), "closed" in match[4])

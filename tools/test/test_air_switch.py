@@ -152,7 +152,7 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
     assert verified(found), found["decisions_again"]
     assert found["slots_with_two_senders"] == 0
     assert found["flight"] is not None
-    assert stranger.said > 10
+    assert stranger.sent_count > 10
     refused = {reason for counts in found["not_taken_in"].values() for reason in counts}
     assert {"other time", "repeated", "rejected"} <= refused
     whole = tmp_path / "whole"

@@ -142,8 +142,8 @@ def sweep(
         content: dict[str, Any] = {"axes": plain, "base": dict(base or {}), "seeds": chosen}
         plan = make_sweep(content, "sweep", first_seed=first_seed)
 
-    given = {"preset": preset, "axes": axes, "base": base, "seeds": seeds, "first_seed": first_seed}
-    said = ", ".join(f"{name}={value!r}" for name, value in given.items() if value is not None)
+    arguments = {"preset": preset, "axes": axes, "base": base, "seeds": seeds, "first_seed": first_seed}
+    call = ", ".join(f"{name}={value!r}" for name, value in arguments.items() if value is not None)
     if jobs > 1 or out is not None:
         _refuse_registered(plan, "jobs" if jobs > 1 else "out", jobs if jobs > 1 else str(out))
 
@@ -158,4 +158,4 @@ def sweep(
         with closing(Journal(place, plan.batch)) as journal:
             table = SweepTable(plan, run_all(plan.batch, journal, jobs=jobs, advance=advance))
         write_results(place, table, code)
-    return SweepResult(plan.name, plan.axes, place, f"dtsa.sweep({said})", table, code)
+    return SweepResult(plan.name, plan.axes, place, f"dtsa.sweep({call})", table, code)

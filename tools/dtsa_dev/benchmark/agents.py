@@ -34,10 +34,10 @@ def agents() -> Iterator[Measurement]:
             nodes = _wait_for_nodes(ros, Path(place) / "flight")
             time.sleep(BEGIN_S + SETTLE_S)
             forms = {"UDP": [process.pid for process in udp], "ROS": nodes}
-            before, begun = {name: _processor_s(pids) for name, pids in forms.items()}, time.monotonic()
+            before, start = {name: _processor_s(pids) for name, pids in forms.items()}, time.monotonic()
             time.sleep(WINDOW_S)
             used = {name: _processor_s(pids) - before[name] for name, pids in forms.items()}
-            slots = (time.monotonic() - begun) / SLOT_S
+            slots = (time.monotonic() - start) / SLOT_S
             cost = {name: 1e6 * used[name] / slots / AGENTS for name in forms}
             memory = {name: _memory_mb(pids) for name, pids in forms.items()}
             _end_agents(udp)

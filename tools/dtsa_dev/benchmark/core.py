@@ -52,16 +52,16 @@ FLIGHTS: tuple[tuple[dict[str, Any], float], ...] = (
 
 def seconds(call: Callable[[], object], least_s: float = 0.1) -> float:
     """Median time of one call, s, of batches of about a hundredth of ``least_s`` each, for ``least_s`` in all."""
-    begun = time.perf_counter()
+    start = time.perf_counter()
     call()
-    batch = max(1, int(least_s / 100 / max(time.perf_counter() - begun, 1e-8)))
+    batch = max(1, int(least_s / 100 / max(time.perf_counter() - start, 1e-8)))
     samples: list[float] = []
     end = time.perf_counter() + least_s
     while time.perf_counter() < end or len(samples) < 5:
-        begun = time.perf_counter()
+        start = time.perf_counter()
         for _ in range(batch):
             call()
-        samples.append((time.perf_counter() - begun) / batch)
+        samples.append((time.perf_counter() - start) / batch)
     return statistics.median(samples)
 
 
@@ -167,9 +167,9 @@ def _mean_of_medians(
         samples = []
         for _ in range(repeats):
             put(state)
-            begun = time.perf_counter()
+            start = time.perf_counter()
             step()
-            samples.append(time.perf_counter() - begun)
+            samples.append(time.perf_counter() - start)
         times.append(statistics.median(samples))
     return 1e6 * statistics.fmean(times)
 
@@ -206,10 +206,10 @@ def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0
     while not times or sum(times) < least_s:
         swarm.reset()
         scenario.advance(0, swarm)
-        begun = time.perf_counter()
+        start = time.perf_counter()
         for slot in range(count):
             swarm.complete(slot, swarm.begin(slot))
-        times.append(time.perf_counter() - begun)
+        times.append(time.perf_counter() - start)
     return 1e6 * min(times) / count
 
 
@@ -233,7 +233,7 @@ def _fastest(settings: dict[str, Any], repeats: int) -> float:
     run = run_config({**settings, "seed": 1})
     times = []
     for _ in range(repeats):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         simulate(run)
-        times.append(time.perf_counter() - begun)
+        times.append(time.perf_counter() - start)
     return min(times)

@@ -70,9 +70,9 @@ class EmulatedHost:
     def plug(self, address: str) -> None:
         """An interface of the same name is made anew."""
         with inside(self):
-            made = _new_cable(address)
-            os.dup2(made, self.cable, inheritable=False)
-            os.close(made)
+            cable = _new_cable(address)
+            os.dup2(cable, self.cable, inheritable=False)
+            os.close(cable)
 
     def readdress(self, address: str) -> None:
         """Its interface gets another address in place of the one that it has."""
@@ -91,11 +91,11 @@ def hosts(count: int) -> Iterator[list[EmulatedHost]]:
     with ExitStack() as stack:
         home = _opened(stack, _OWN, os.O_RDONLY)
         try:
-            found = [_start_host(stack, number) for number in range(1, count + 1)]
+            started = [_start_host(stack, number) for number in range(1, count + 1)]
         finally:
             if _libc().setns(home, _CLONE_NEWNET):
                 os._exit(1)  # whatever this process did from here on would be in the wrong place
-        yield found
+        yield started
 
 
 @contextmanager

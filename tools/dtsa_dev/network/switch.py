@@ -178,7 +178,7 @@ class Intruder:
     def __init__(self, switch: Switch, seed: int) -> None:
         self._switch, self._random = switch, random.Random(seed)
         self._heard: deque[bytes] = deque(maxlen=_KEPT)
-        self.said = 0
+        self.sent_count = 0
         switch.listener = self.hear
 
     def hear(self, frame: bytes) -> None:
@@ -186,7 +186,7 @@ class Intruder:
         self._heard.append(frame)
         for _ in range(_FLOOD if self._random.random() < 0.01 else 1):
             self._switch.broadcast(self._forged(frame))
-            self.said += 1
+            self.sent_count += 1
 
     def _forged(self, frame: bytes) -> bytes:
         """A frame again; one of long ago; or one with a byte, all of the swarm's frame, or everything changed."""

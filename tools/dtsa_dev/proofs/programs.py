@@ -24,18 +24,18 @@ class NotHere(DtsaError):
 
 def tool(name: str, package: str) -> str:
     """The path of a program; ``package`` is the Debian package that has it."""
-    found = shutil.which(name)
-    if found is None:
+    path = shutil.which(name)
+    if path is None:
         raise NotHere(f"missing: {name}; on Debian and Ubuntu: sudo apt install {package}")
-    return found
+    return path
 
 
 def sources(library: Path = LIBRARY, without: Sequence[str] = ()) -> list[Path]:
     """The C files of libdtsa."""
-    found = [path for path in sorted(library.rglob("*.c")) if path.name not in without]
-    if not found:
+    files = [path for path in sorted(library.rglob("*.c")) if path.name not in without]
+    if not files:
         raise ConfigError("libdtsa", str(library), "a folder with its sources")
-    return found
+    return files
 
 
 def compile_program(

@@ -17,10 +17,10 @@ class DtsaError(Exception):
 def shown(value: object) -> str:
     """A value as errors repeat it: not too long, whatever its own ``__repr__`` does."""
     try:
-        given = repr(value)
+        text = repr(value)
     except Exception:
-        given = f"<{type(value).__name__}>"
-    return given if len(given) <= _LONGEST else given[:_LONGEST] + " ..."
+        text = f"<{type(value).__name__}>"
+    return text if len(text) <= _LONGEST else text[:_LONGEST] + " ..."
 
 
 def did_you_mean(word: str, words: Iterable[str]) -> str:

@@ -182,14 +182,14 @@ class StationSettings:
         verdict = lib.dtsa_datagram_read(self.c, data, len(data), out)
         if verdict:
             return ParsedDatagram(VERDICTS[verdict])
-        names = tuple(Named(one.id, one.late_ns) for one in list(out.names)[: self.names] if one.id)
+        names = tuple(Named(entry.id, entry.late_ns) for entry in list(out.names)[: self.names] if entry.id)
         frame = bytes(ffi.buffer(out.frame, out.frame_length))
         return ParsedDatagram("", out.sender, out.slot, out.late_ns, names, frame)
 
     def hears(self, names: tuple[Named, ...], agent: int) -> bool | None:
         """Whether the sender of a datagram with these names hears an agent; None: it does not say."""
-        told: int = lib.dtsa_names_hear(ffi.new("dtsa_named[]", list(names)), len(names), self.names, agent)
-        return told > 0 if told else None
+        answer: int = lib.dtsa_names_hear(ffi.new("dtsa_named[]", list(names)), len(names), self.names, agent)
+        return answer > 0 if answer else None
 
     def write(self, frame: bytes, slot: int, late_ns: int = 0, names: tuple[tuple[int, int], ...] = ()) -> bytes:
         """The datagram of a frame that carries no tag yet.

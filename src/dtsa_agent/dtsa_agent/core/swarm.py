@@ -142,7 +142,7 @@ class Swarm:
             "n": config.agents, "v": len(tables), "l": count, "s": steps, "f": FRAME_MAX,
             "p": lib.swarm_policy_bytes(ffi.addressof(kernel, "config")),
         }  # fmt: skip
-        self._lend(kernel, sizes)
+        self._share_arrays(kernel, sizes)
         self.local[:], self.observer[:], self.final[:] = np.array(self.ids) - 1, np.array(tables) - 1, 1
         self.known_goal[:] = self.scenario.target
         self.rows = np.arange(count)  # (L,) table of each local agent, unless shared
@@ -183,15 +183,15 @@ class Swarm:
             decay=memory(self._decay), decay_len=DECAY_STEPS,
         )  # fmt: skip
 
-    def _lend(self, kernel: Any, sizes: dict[str, int]) -> None:
+    def _share_arrays(self, kernel: Any, sizes: dict[str, int]) -> None:
         """Make the arrays and lend them to C."""
-        self._lent = []
+        self._borrowed = []
         for name, letters in _SHAPES.items():
             shape = tuple(sizes[letter] if letter in sizes else int(letter) for letter in letters)
             array = np.zeros(shape, _ITEMS[name])
-            self._lent.append(memory(array, writable=True))
+            self._borrowed.append(memory(array, writable=True))
             setattr(self, name, array)
-            setattr(kernel, name, self._lent[-1])
+            setattr(kernel, name, self._borrowed[-1])
         self._senders, self._lengths = self.senders.data, self.frame_length.data
         self._frames: list[memoryview] = [row.data for row in self.frames]
 

@@ -40,11 +40,11 @@ class CommandParser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does; an option that there is not is named before one that is missing."""
-        known = self._option_string_actions
+        options = self._option_string_actions
         for word in () if self._subparsers else args or ():
             option = word.partition("=")[0]
-            if option.startswith("--") and option not in (*known, "--"):
-                self.error(f"option {word}: unknown{hint(option, known)}")
+            if option.startswith("--") and option not in (*options, "--"):
+                self.error(f"option {word}: unknown{hint(option, options)}")
         return super().parse_known_args(args, namespace)
 
 

@@ -240,15 +240,15 @@ _OF_PROTOCOL = ("policy", "slot_ms", "moving", "auth_session")
 _SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "radius_m", "channel", "rate")
 
 
-def _swarm(given: dict[str, str], settings: Any) -> SwarmConfig:
+def _swarm(options: dict[str, str], settings: Any) -> SwarmConfig:
     """Settings of the swarm that flies the protocol."""
     from dtsa_agent.core import SwarmConfig
     from dtsa_agent.core.settings.declaration import settings_of
     from dtsa_agent.crazyflie.onboard import check_on_board, key_of
 
     specs = {spec.name: spec for spec in settings_of(SwarmConfig)}
-    values = {"policy": "lease", **{name: specs[name].parse(text) for name, text in given.items()}}
-    values |= {"agents": settings.agents, "seed": settings.seed, "auth": "auth_session" in given}
+    values = {"policy": "lease", **{name: specs[name].parse(text) for name, text in options.items()}}
+    values |= {"agents": settings.agents, "seed": settings.seed, "auth": "auth_session" in options}
     swarm = SwarmConfig.from_dict(values)
     check_on_board(swarm)
     key_of(swarm)

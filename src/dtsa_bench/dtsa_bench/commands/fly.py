@@ -178,12 +178,12 @@ def late_agents(text: str | None) -> dict[int, float]:
     """
     late = {}
     for part in () if text is None else text.split(","):
-        found = re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part)
-        if not found:
+        match = re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part)
+        if not match:
             from dtsa_agent.core.errors import ConfigError
 
             raise ConfigError("late", text, "cfK=S,...: agents, and seconds after slot 0")
-        late[int(found[1])] = float(found[2])
+        late[int(match[1])] = float(match[2])
     return late
 
 

@@ -49,11 +49,11 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
         dest="swarm_file",
         help="YAML file of settings that all computers share, as `agents: 12`; options go before it",
     )
-    known: set[str] = set()
+    names: set[str] = set()
     for air in AIRS:
         group = parser.add_argument_group(f"what carries the frames: --air {air}")
-        add_options(group, settings_class(air), "port", skip=known)
-        known |= {setting.name for setting in settings_of(settings_class(air))}
+        add_options(group, settings_class(air), "port", skip=names)
+        names |= {setting.name for setting in settings_of(settings_class(air))}
     parser.add_argument_group("authentication").add_argument(
         "--seal",
         action=argparse.BooleanOptionalAction,
@@ -95,14 +95,14 @@ def _read_file(args: argparse.Namespace) -> None:
         air, f"air in {path}"
     )
     sections: dict[str, type[Settings]] = {"swarm": SwarmConfig, "port": settings_class(args.air), "own": AgentSettings}
-    known = {setting.name: (name, setting) for name, cls in sections.items() for setting in settings_of(cls)}
+    settings = {setting.name: (name, setting) for name, cls in sections.items() for setting in settings_of(cls)}
     for name, value in values.items():
         if name == "id":
             raise ConfigError(f"id in {path}", value, "what all agents share; each has an --id of its own")
-        if name not in known:
-            allowed = f"a setting of the swarm, of the port {args.air} or of the agent{hint(str(name), known)}"
+        if name not in settings:
+            allowed = f"a setting of the swarm, of the port {args.air} or of the agent{hint(str(name), settings)}"
             raise ConfigError(f"{name} in {path}", value, allowed)
-        section, setting = known[name]
+        section, setting = settings[name]
         option = _OPTIONS.get(name, f"{section}.{name}")
         checked = value if setting.custom else setting.check(value, f"{name} in {path}")
         if getattr(args, option, None) is None:

@@ -201,16 +201,16 @@ bag take like any other."""
 
 def summary_lines(summary: dict[str, object]) -> list[str]:
     """A summary, indented where it has parts."""
-    found = []
+    rows = []
     for key, value in summary.items():
         if isinstance(value, dict):
-            found.append(f"{key.replace('_', ' ')}:")
-            found += [f"  {line}" for line in summary_lines(value)]
+            rows.append(f"{key.replace('_', ' ')}:")
+            rows += [f"  {line}" for line in summary_lines(value)]
         elif isinstance(value, float):
-            found.append(f"{key.replace('_', ' '):26} {value:.6g}")
+            rows.append(f"{key.replace('_', ' '):26} {value:.6g}")
         else:
-            found.append(f"{key.replace('_', ' '):26} {'-' if value in (None, []) else value}")
-    return found
+            rows.append(f"{key.replace('_', ' '):26} {'-' if value in (None, []) else value}")
+    return rows
 
 
 class LossesCommand(Command):
@@ -253,19 +253,19 @@ def loss_lines(losses: dict[str, Any]) -> list[str]:
     links = [
         (losses["lost"][s][r] / sent, sent, s, r) for s in agents for r in agents if (sent := losses["sent"][s][r])
     ]
-    found = [
+    rows = [
         f"{len(agents)} agents, {len(links)} links, slots of {losses['slot_ns'] / 1e6:g} ms: {losses['frames']} frames,"
         f" {sum(link[1] for link in links)} receptions, {100.0 * losses['loss']:.3g} % lost"
     ]
     if losses["left_out"]:
-        found.append("left out: " + "; ".join(f"{count} frames, {text}" for text, count in losses["left_out"].items()))
+        rows.append("left out: " + "; ".join(f"{count} frames, {text}" for text, count in losses["left_out"].items()))
     memory = losses["memory_slots"]
-    found.append(f"bursts: all links together have a memory of {memory:g} slots" if memory else "bursts: none found")
-    found.append("links that lose most:")
+    rows.append(f"bursts: all links together have a memory of {memory:g} slots" if memory else "bursts: none found")
+    rows.append("links that lose most:")
     for loss, sent, sender, receiver in sorted(links, key=lambda link: -link[0])[:_SHOWN]:
         leave, bad = losses["leave"][sender][receiver], losses["loss_bad"][sender][receiver]
         phases = (
             f"; bad phases of {1.0 / leave:.3g} slots, {100.0 * bad:.3g} % lost in them" if 0.0 < leave < 1.0 else ""
         )
-        found.append(f"  cf{sender + 1} -> cf{receiver + 1}: {100.0 * loss:.3g} % of {sent}{phases}")
-    return found
+        rows.append(f"  cf{sender + 1} -> cf{receiver + 1}: {100.0 * loss:.3g} % of {sent}{phases}")
+    return rows

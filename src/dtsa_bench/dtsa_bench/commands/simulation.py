@@ -188,10 +188,10 @@ def _fly_sweep(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     from dtsa_bench.experiments.tables import SweepTable, table_text, write_results
     from dtsa_bench.runs.options import processes
 
-    begun, code, say = time.monotonic(), code_digest(sweep.batch.plug_ins), (lambda _: None) if args.json else print
+    start, code, say = time.monotonic(), code_digest(sweep.batch.plug_ins), (lambda _: None) if args.json else print
     table = SweepTable(sweep, run_in(directory, sweep.batch, jobs=processes(args.jobs), cluster=args.cluster))
     write_results(directory, table, code)
-    flown = time.monotonic() - begun
+    flown = time.monotonic() - start
     command = f"{program()} {shlex.join(sys.argv[1:])}"
     say(table_text(table, shutil.get_terminal_size((0, 0)).columns))
     if args.paper:
@@ -203,7 +203,7 @@ def _fly_sweep(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
         from dtsa_bench.pages.report.tables import write_report
 
         say(f"report: {write_report(table, directory, code, command)}")
-    seconds = f"{flown:.1f} s, {time.monotonic() - begun:.1f} s with the report"
+    seconds = f"{flown:.1f} s, {time.monotonic() - start:.1f} s with the report"
     say(f"{sweep.name}: {len(table.rows)} runs in {seconds}")
     if args.json:
         print((directory / "results.json").read_text(encoding="utf-8"), end="")

@@ -121,18 +121,18 @@ def lines(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) ->
                 {} if name is None else {spec["series"]: name}
             )
             data = _points(table, labels, spec["x"], measure)
-            known = np.isfinite(data[:, 0])
-            place = np.array(xs, dtype=float)[known]
+            finite = np.isfinite(data[:, 0])
+            place = np.array(xs, dtype=float)[finite]
             # Lines that lie on each other stay visible: later ones are thinner.
             (line,) = axis.plot(
                 place,
-                data[known, 0],
+                data[finite, 0],
                 color=shades[number],
                 marker=MARKERS[number % len(MARKERS)],
                 linewidth=2.6 - 0.35 * number,
                 markersize=5.5 - 0.5 * number,
             )
-            axis.fill_between(place, data[known, 1], data[known, 2], color=shades[number], alpha=0.13, linewidth=0)
+            axis.fill_between(place, data[finite, 1], data[finite, 2], color=shades[number], alpha=0.13, linewidth=0)
             if axis is axes[0]:
                 handles.append(line)
         title = label_of(measure)

@@ -65,16 +65,16 @@ def write_paper(table: SweepTable, directory: Path, form: str, code: str, comman
 
 def _origin(table: SweepTable, code: str, command: str) -> dict[str, str]:
     """How it was made, by name."""
-    sweep, made = table.sweep, read_provenance()
-    changed = ", with changes" if made["tree_changed"] else ""
+    sweep, provenance = table.sweep, read_provenance()
+    changed = ", with changes" if provenance["tree_changed"] else ""
     return {
         "sweep": f"{sweep.name}, {len(table.rows)} flights, {len(sweep.cells)} settings",
         "command": command,
         "seeds": seeds_text(sweep.seeds),
-        "written": str(made["date"]),
-        "commit": f"{made['commit']}{changed}",
+        "written": str(provenance["date"]),
+        "commit": f"{provenance['commit']}{changed}",
         "code": f"{code} (digest of the code that flew)",
-        "versions": f"dtsa {__version__}, Python {made['python']}, NumPy {np.__version__}, "
+        "versions": f"dtsa {__version__}, Python {provenance['python']}, NumPy {np.__version__}, "
         f"Matplotlib {matplotlib.__version__}",
     }
 
@@ -92,11 +92,11 @@ def _figures(sweep: Sweep) -> Sequence[Mapping[str, Any]]:
         return sweep.figures
     axes, y = list(sweep.axes), [CRASHED, "age_mean_slots"]
     x = next((axis for axis in axes if _numbers([cell.labels[axis] for cell in sweep.cells])), None)
-    rest = [axis for axis in axes if axis != (axes[0] if x is None else x)]
-    roles = dict(zip(("series", "facets"), rest, strict=False))
-    if x is not None and len(rest) <= 2:
+    others = [axis for axis in axes if axis != (axes[0] if x is None else x)]
+    roles = dict(zip(("series", "facets"), others, strict=False))
+    if x is not None and len(others) <= 2:
         return [{"kind": "lines", "name": "lines", "x": x, "y": y, **roles}]
-    return [{"kind": "bars", "name": "bars", "x": axes[0], "y": y, **roles}] if x is None and len(rest) <= 1 else []
+    return [{"kind": "bars", "name": "bars", "x": axes[0], "y": y, **roles}] if x is None and len(others) <= 1 else []
 
 
 def _numbers(levels: Sequence[object]) -> bool:

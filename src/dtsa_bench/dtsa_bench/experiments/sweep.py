@@ -229,17 +229,17 @@ def _check(cells: list[Cell], seed: int) -> None:
 
     :raises ConfigError: naming what is not usable.
     """
-    known: dict[tuple[Any, Any], dict[str, Any]] = {}  # by file and length of a slot
+    read: dict[tuple[Any, Any], dict[str, Any]] = {}  # by file and length of a slot
     for cell in cells:
         losses = cell.settings.get("losses")
         if not losses or isinstance(losses, Mapping):
             cell.run(seed)
             continue
         key = str(losses), cell.settings.get("slot_ms")
-        cell.settings["losses"] = known.get(key, losses)
-        found = cell.run(seed).air.losses
-        if isinstance(found, MeasuredLosses):
-            cell.settings["losses"] = known.setdefault(key, found.to_dict())
+        cell.settings["losses"] = read.get(key, losses)
+        losses_of_run = cell.run(seed).air.losses
+        if isinstance(losses_of_run, MeasuredLosses):
+            cell.settings["losses"] = read.setdefault(key, losses_of_run.to_dict())
 
 
 def _levels(axis: str, values: object) -> list[Any] | dict[str, dict[str, Any]]:
@@ -255,15 +255,15 @@ def _levels(axis: str, values: object) -> list[Any] | dict[str, dict[str, Any]]:
     raise ConfigError(f"axes.{axis}", values, "a list of values, or names with settings each")
 
 
-def _seeds(given: object, count: int | None, first: int | None) -> tuple[int, ...]:
+def _seeds(listed: object, count: int | None, first: int | None) -> tuple[int, ...]:
     """Seeds that a file lists, or a number of them from the first one on."""
-    if isinstance(given, list):
-        if not given or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in given):
-            raise ConfigError("seeds", given, "a number of seeds, or a list of whole numbers")
+    if isinstance(listed, list):
+        if not listed or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in listed):
+            raise ConfigError("seeds", listed, "a number of seeds, or a list of whole numbers")
         if count is None and first is None:
-            return tuple(given)
-        given = len(given)
-    number = given if count is None else count
+            return tuple(listed)
+        listed = len(listed)
+    number = listed if count is None else count
     if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= 1_000_000:
         raise ConfigError("seeds", number, "1 to 1000000")
     start = FIRST_SEED if first is None else first

@@ -93,8 +93,8 @@ class Group:
         """Value and ends of the interval of :data:`CRASHED` or a measure; not a number if no run counts."""
         if measure == CRASHED and not self.crashed.total:
             return math.nan, math.nan, math.nan
-        found = self.crashed if measure == CRASHED else self.mean(measure)
-        return found.value, found.low, found.high
+        statistic = self.crashed if measure == CRASHED else self.mean(measure)
+        return statistic.value, statistic.low, statistic.high
 
     def texts(self, measure: str, dash: str = "–") -> tuple[str, str]:
         """Value and interval as text; a dash and nothing if no run counts."""
@@ -322,4 +322,4 @@ def _latex_cell(value: str, interval: str) -> str:
 
 def latex_text(text: str) -> str:
     """Return a text as LaTeX prints it."""
-    return re.sub(r"[\\~^<>|–&%$#_{}]", lambda found: _LATEX[found.group()], text)
+    return re.sub(r"[\\~^<>|–&%$#_{}]", lambda match: _LATEX[match.group()], text)

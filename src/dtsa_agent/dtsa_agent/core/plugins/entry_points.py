@@ -105,7 +105,9 @@ class PluginSwarm(Swarm):
         """Notes the parts of each observer that may say something, with the size of it, in the frame's order."""
         policy, estimator = self.config.policy_row, self.config.estimator_row
         parts = ((self.policies, policy.own_bytes), (self.estimators, estimator.own_bytes))
-        self._speakers = [[(made[row], size) for made, size in parts if made] for row in range(len(self._ids))]
+        self._speakers = [
+            [(instances[row], size) for instances, size in parts if instances] for row in range(len(self._ids))
+        ]
         self._listen_to_outcome = any(hasattr(part, "slot_over") for row in self._speakers for part, _ in row)
 
     def decide(self, slot: int) -> None:

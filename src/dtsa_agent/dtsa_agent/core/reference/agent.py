@@ -79,15 +79,15 @@ class Agent:
         own = Frame(self.index + 1, rules.slot_on_air(slot), c_r, self.position, self.velocity, intent)
         if rules.profile != EXTENDED:
             return encode(own, rules.position_step)
-        said = TurnAnnouncement()
+        announcement = TurnAnnouncement()
         if rules.policy == "lease":
             leaves = self.present == LEAVES
-            said = announce_turns(self.memory, self.index, self.table, slot, self.velocity, self.final, leaves)
-        used = -(-len(said.leases) // SECTION_BYTES) + bool(said.relay) + bool(said.far)
+            announcement = announce_turns(self.memory, self.index, self.table, slot, self.velocity, self.final, leaves)
+        used = -(-len(announcement.leases) // SECTION_BYTES) + bool(announcement.relay) + bool(announcement.far)
         carried = gossip.collect(self.table, self.index, slot, SECTIONS - used, rules) if rules.gossip else ()
         frame = ExtendedFrame(
-            own, said.c_s, said.leaving, self.memory.probation, carried,
-            said.leases, said.relay, said.far, said.far_lessee,
+            own, announcement.c_s, announcement.leaving, self.memory.probation, carried,
+            announcement.leases, announcement.relay, announcement.far, announcement.far_lessee,
         )  # fmt: skip
         return encode_extended(frame, rules.position_step)
 

@@ -114,8 +114,8 @@ class Counts:
 
 def centred(a: int, b: int) -> int:
     """``a`` modulo ``b``, from -b/2 to b/2."""
-    rest = a % b
-    return rest - b if rest > b // 2 else rest
+    remainder = a % b
+    return remainder - b if remainder > b // 2 else remainder
 
 
 def limited(value: int, limit: int) -> int:
@@ -194,8 +194,8 @@ class Station:
         if not 1 <= sender <= self.rules.agents:
             return UNKNOWN_AGENT
         if self.settings.key:
-            frame, given = frame[:-TAG_LENGTH], frame[-TAG_LENGTH:]
-            if self._tag(slot, frame + times) != given:
+            frame, tag = frame[:-TAG_LENGTH], frame[-TAG_LENGTH:]
+            if self._tag(slot, frame + times) != tag:
                 return REJECTED
         if slot >= self.cycle:
             return NO_FRAME
@@ -267,11 +267,11 @@ class Station:
         recent = [p for p in self.peers if self._is_recent(p, p.heard_ns, now)]
         every = 1 + len(recent)
         here = 1 + sum(self._is_same(p.origin_ns, self.origin_ns) for p in recent)
-        there = sum(p.steady and self._is_same(p.origin_ns, origin_ns) for p in recent)
+        in_other_time = sum(p.steady and self._is_same(p.origin_ns, origin_ns) for p in recent)
         earlier = self._apart(origin_ns, self.origin_ns) < 0
-        if 2 * there > every or (earlier and (self.state == ALONE or 2 * there == every)):
+        if 2 * in_other_time > every or (earlier and (self.state == ALONE or 2 * in_other_time == every)):
             return True
-        if not there:
+        if not in_other_time:
             return False
         if now - self.in_step_ns > self.patience_ns:
             return True
@@ -387,14 +387,14 @@ class Station:
 
     def _close_slot(self) -> None:
         if self.running:
-            self.agent.remember_own(self.slot, self.said)
+            self.agent.remember_own(self.slot, self.pending)
             self.agent.end(self.slot)
         self.running, self.frame = False, b""
 
     def _restart(self, now: Ns) -> None:
         """From the next slot on it takes part, knowing nothing."""
         if self.frame:
-            self.said = b""
+            self.pending = b""
         self._close_slot()
         self.slot = self._slot_at(now + self.lead_ns)
         self.first, self.newcomer, self.hovers = self.slot + 1, True, HOVERS_NEW
@@ -443,16 +443,16 @@ class Station:
         if self.leaving and not self.gone:  # its last frame did not leave
             self.agent.present = LEAVES
         chosen = self.agent.decide(slot).index + 1
-        self.said = self.frame = self.agent.frame(slot) if self.agent.sends else b""
+        self.pending = self.frame = self.agent.frame(slot) if self.agent.sends else b""
         if self.frame and self._leaves_out(slot, now):
-            self.said = self.frame = b""
+            self.pending = self.frame = b""
         self.running, self.awaits = True, chosen not in (0, self.settings.id)
         early, self.early = self.early, []
-        for one in early:
-            if one[0] > slot:
-                self.early.append(one)
+        for entry in early:
+            if entry[0] > slot:
+                self.early.append(entry)
             else:
-                self._hear_frame(one[0], one[2])
+                self._hear_frame(entry[0], entry[2])
 
     def receive(self, data: Datagram, arrival: Ns) -> int:
         """Accepts a datagram, or says why not. Anything may be handed in."""
@@ -527,7 +527,7 @@ class Station:
 
     def _send(self, late_ns: int, now: Ns) -> Datagram:
         if late_ns > self.latest_send_ns:  # it would disturb the next turn
-            self.frame = self.said = b""
+            self.frame = self.pending = b""
             return b""
         datagram = self._write(late_ns, now)
         self.gone = self.leaving and self.frame[2] == LEAVING
@@ -540,7 +540,7 @@ class Station:
         if taken:
             self.refused_since = None
             return
-        self.said = b""
+        self.pending = b""
         if self.refused_since is None:
             self.refused_since = now
 

@@ -227,19 +227,19 @@ class Settings:
 
 def build(cls: type[T], values: Mapping[str, Any]) -> T:
     """What :meth:`Settings.from_dict` does, for classes that read their values in a way of their own first."""
-    known = {spec.name: spec for spec in settings_of(cls)}
-    given = dict(names_with_values(values, "settings"))
-    for name, value in given.items():
-        if name not in known:
-            raise ConfigError(str(name), value, UNKNOWN + ", ".join(known))
-        section = known[name].section
+    specs = {spec.name: spec for spec in settings_of(cls)}
+    arguments = dict(names_with_values(values, "settings"))
+    for name, value in arguments.items():
+        if name not in specs:
+            raise ConfigError(str(name), value, UNKNOWN + ", ".join(specs))
+        section = specs[name].section
         if section and isinstance(value, Mapping):
             with named(name):
-                given[name] = section.from_dict(value)
-    for spec in known.values():
-        if spec.required and spec.name not in given:
+                arguments[name] = section.from_dict(value)
+    for spec in specs.values():
+        if spec.required and spec.name not in arguments:
             raise ConfigError(spec.name, None, spec.allowed)
-    return cls(**given)
+    return cls(**arguments)
 
 
 def check(config: Any) -> None:

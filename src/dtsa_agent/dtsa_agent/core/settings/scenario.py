@@ -80,9 +80,9 @@ class Course:
             "pause": np.array(plan.pause, dtype=np.int64), "moving": np.array(plan.moving, dtype=np.uint8),
             "leg": self.leg, "since": self._since, "changed": self.changed, "goal": self.goal,
         }  # fmt: skip
-        self._lent = {name: memory(array) for name, array in arrays.items()}
+        self._borrowed = {name: memory(array) for name, array in arrays.items()}
         sizes = {"n": plan.start.shape[1], "count": len(local), "goal_count": self._legs, "r_min": plan.r_min}
-        self.kernel = ffi.new("course *", {**sizes, **self._lent})
+        self.kernel = ffi.new("course *", {**sizes, **self._borrowed})
 
     def reset(self) -> None:
         """Back to the start of the flight."""
@@ -220,8 +220,8 @@ def _planned(config: SwarmConfig, plain: Scenario, random: np.random.Generator) 
         if config.pause_slots:
             begin[moving] = random.integers(0, config.pause_slots, int(moving.sum()))
     plan = Plan(plain.start, np.ascontiguousarray(goals), begin, pause, moving, config.r_min)
-    known = config.scenario == "staggered"
-    return Scenario(plain.start, np.ascontiguousarray(goals[-1]), moving, plan, known)
+    goals_known = config.scenario == "staggered"
+    return Scenario(plain.start, np.ascontiguousarray(goals[-1]), moving, plan, goals_known)
 
 
 WAYPOINT_GAP = 0.9  # m, between a waypoint and everybody's last goal, and among the movers' n-th waypoints
@@ -232,18 +232,18 @@ def _waypoints(config: SwarmConfig, plain: Scenario, random: np.random.Generator
     ax, ay, _ = half_axes(config)
     points = np.repeat(plain.start[None], config.stops, axis=0)
     for stop in range(config.stops):
-        taken = list(plain.target.T)
+        occupied = list(plain.target.T)
         for k in np.flatnonzero(plain.moving):
             gap = WAYPOINT_GAP
             while True:
                 angle, r = 2 * math.pi * random.random(), math.sqrt(random.random())
                 z = random.uniform(-0.5, 0.5)
                 point = np.round([ax * r * math.cos(angle), ay * r * math.sin(angle), z], 6)
-                if min(float(np.sqrt(((point - other) ** 2).sum())) for other in taken) >= gap:
+                if min(float(np.sqrt(((point - other) ** 2).sum())) for other in occupied) >= gap:
                     break
                 gap *= 0.998  # a crowded room has no better place
             points[stop, :, k] = point
-            taken.append(point)
+            occupied.append(point)
     return points
 
 
@@ -274,10 +274,10 @@ def _streams(config: SwarmConfig) -> tuple[Array, NDArray[np.int64]]:
     along = -length / 2 - depth + (rows - 1) * gap / 2
     places[0, :half], places[1, :half] = along[:half], lane[:half]
     places[0, half:movers], places[1, half:movers] = lane, along
-    rest = config.agents - movers
-    if rest:
-        radius = max(length / 2 + rows * gap + 1.0, gap * rest / (2 * math.pi))
-        angle = 2 * np.pi * np.arange(rest) / rest
+    hovering = config.agents - movers
+    if hovering:
+        radius = max(length / 2 + rows * gap + 1.0, gap * hovering / (2 * math.pi))
+        angle = 2 * np.pi * np.arange(hovering) / hovering
         places[0, movers:], places[1, movers:] = radius * np.cos(angle), radius * np.sin(angle)
     return places, np.full(config.agents, -1, dtype=np.int64)
 

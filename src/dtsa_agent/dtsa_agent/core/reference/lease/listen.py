@@ -29,10 +29,10 @@ def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: Exte
     for entry in frame.gossip:
         hear_gossip(memory, self_index, table, slot - entry.age, entry)
     turns = memory.turns_of_leases(slot, frame.c_s, len(frame.leases))
-    given = [(turn, lessee) for turn, lessee in zip(turns, frame.leases, strict=False) if lessee]
+    leased = [(turn, lessee) for turn, lessee in zip(turns, frame.leases, strict=False) if lessee]
     if memory.owner(slot) == sender:
-        memory.settled[sender] = any(memory.owner(turn) == sender and memory.is_anchor(turn) for turn, _ in given)
-    for turn, lessee in given:
+        memory.settled[sender] = any(memory.owner(turn) == sender and memory.is_anchor(turn) for turn, _ in leased)
+    for turn, lessee in leased:
         memory.note(self_index, slot, sender + 1, turn, lessee, sender + 1)
     for ahead, lessee in frame.relay:
         memory.note(self_index, slot, sender + 1, slot + ahead, lessee, 0)

@@ -117,17 +117,17 @@ class Memory:
         """
         if not self.now < turn < self.now + self.window or self.is_main(turn):
             return
-        known, mine = self.leases.get(turn), lessee == self_index + 1
-        if known is None:
+        entry, mine = self.leases.get(turn), lessee == self_index + 1
+        if entry is None:
             self.leases[turn] = Lease(lessee, issuer)
-        elif lessee == known.lessee:
-            known.issuer = known.issuer or issuer
-        elif sender == known.lessee:
+        elif lessee == entry.lessee:
+            entry.issuer = entry.issuer or issuer
+        elif sender == entry.lessee:
             if not mine:
-                known.lessee = lessee
+                entry.lessee = lessee
             elif slot > self.spoke:
                 self.leases[turn] = Lease(lessee, 0)
-        elif known.issuer not in (0, issuer, self_index + 1, HANDED) and issuer and lessee < known.lessee:
+        elif entry.issuer not in (0, issuer, self_index + 1, HANDED) and issuer and lessee < entry.lessee:
             self.leases[turn] = Lease(lessee, issuer)
 
     def turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
