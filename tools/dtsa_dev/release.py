@@ -82,7 +82,7 @@ def python(version: str) -> str:
 
 
 class Release:
-    """Makes and tries the files of a release.
+    """Make and try the files of a release.
 
     :param out: folder for the files.
     :param work: folder for all else.

@@ -57,7 +57,7 @@ class SweepResult:
         return [*([("base", base)] if base else []), ("kept", where), ("more", more)]
 
     def write_paper(self, directory: str | Path, figures: str = "pdf") -> list[Path]:
-        """Writes figures, `table.tex` (booktabs) and `table.csv` for a paper; `table.json` says how they were made.
+        """Write figures, `table.tex` (booktabs) and `table.csv` for a paper; `table.json` says how they were made.
 
         Figures and the LaTeX table say so, too: command, seeds, date, commit, versions.
 

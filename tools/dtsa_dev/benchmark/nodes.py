@@ -101,14 +101,14 @@ class _Asker:
             self._loop.close()
 
     def _meet(self) -> None:
-        """Asks until all have answered one question."""
+        """Ask until all have answered one question."""
         deadline = time.monotonic() + _START_S
         while (heard := self._round(patience_s=0.2)) < self._processes:
             if time.monotonic() > deadline:
                 raise DtsaError(f"only {heard} of {self._processes} processes answer after {_START_S:g} s")
 
     def _round(self, patience_s: float = math.inf) -> int:
-        """Asks once; how many have answered that within a time."""
+        """Ask once; how many have answered that within a time."""
         self._number += 1
         self._publisher.publish(UInt32(data=self._number))
         end, heard = time.monotonic() + patience_s, 0

@@ -40,7 +40,7 @@ _ROLE = re.compile(r":(?:class|func|meth|mod|data|attr|exc):\s?<code>[.~]?")
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds the pages that are not in `docs`."""
+    """Add the pages that are not in `docs`."""
     for name, place in TOP.items():
         files.append(File.generated(config, place, content=(ROOT / name).read_text(encoding="utf-8")))
     for place, page in MADE.items():
@@ -73,7 +73,7 @@ def on_page_markdown(markdown: str, page: Page, config: Any, files: Files) -> st
 
 
 def on_page_content(html: str, page: Page, config: Any, files: Files) -> str:
-    """Takes away the roles that docstrings write before names."""
+    """Remove the roles that docstrings write before names."""
     return _ROLE.sub("<code>", html)
 
 

@@ -106,13 +106,13 @@ class FakeModems:
 
     # -- from outside -----------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
-        """Changes the channel from now on: ``loss``, ``partition`` and others by name."""
+        """Change the channel from now on: ``loss``, ``partition`` and others by name."""
         with self._lock:
             self._channel.advance(self._slot(time.monotonic_ns()))
             self._channel.set(**values)
 
     def unplug(self, number: int) -> None:
-        """Takes a modem away from its computer; what it holds is lost."""
+        """Take a modem away from its computer; what it holds is lost."""
         with self._lock:
             modem = self._ones[number - 1]
             self.devices[number - 1].unlink()
@@ -123,13 +123,13 @@ class FakeModems:
         self._wake()
 
     def plug(self, number: int) -> None:
-        """Puts a modem back, as another device."""
+        """Put a modem back, as another device."""
         with self._lock:
             self._plug(number - 1)
         self._wake()
 
     def inject(self, number: int, data: bytes) -> None:
-        """Lets other bytes come out of a modem."""
+        """Let other bytes come out of a modem."""
         with self._lock:
             self._write(number - 1, data)
 

@@ -59,7 +59,7 @@ class Links:
 
 
 class Switch:
-    """Joins hosts."""
+    """Join hosts."""
 
     def __init__(
         self, joined: Sequence[EmulatedHost], group: tuple[str, int], config: ChannelConfig, links: Links | None = None
@@ -88,7 +88,7 @@ class Switch:
         return time.monotonic_ns() - self._zero
 
     def set(self, **values: object) -> None:
-        """Changes the medium from the next slot on."""
+        """Change the medium from the next slot on."""
         self.channel.set(**values)
 
     def run(self, until: Callable[[], bool], seconds: float) -> bool:

@@ -148,7 +148,7 @@ def _deaths_and_returns(random: np.random.Generator, swarm: SwarmConfig) -> Iter
 
 
 def happen(fault: Fault, swarm: Swarm) -> None:
-    """Lets a fault happen to a swarm all of whose agents are here, before a slot begins."""
+    """Let a fault happen to a swarm all of whose agents are here, before a slot begins."""
     k = fault.agent - 1
     if fault.kind == "die":
         swarm.present[k] = 0
@@ -165,7 +165,7 @@ def happen(fault: Fault, swarm: Swarm) -> None:
 
 
 def fly_both(setting: CheckedFlight) -> Mapping[str, Any]:
-    """Flies a setting on the compiled core and on the specification, side by side."""
+    """Fly a setting on the compiled core and on the specification, side by side."""
     scenario = make_scenario(setting.swarm)
     pair = Swarm(setting.swarm, scenario, shared_table=setting.shared), ReferenceSwarm(setting.swarm, scenario)
     pair[1].shares = setting.shared

@@ -130,7 +130,7 @@ class Experiment:
         self.moving[agent - 1] = True
 
     def happen(self, event: FlightEvent) -> None:
-        """Lets an event happen now."""
+        """Let an event happen now."""
         swarm, k = self.swarm, event.agent - 1
         if event.kind == "go" and not self.moving[k]:
             self._go(event.agent)

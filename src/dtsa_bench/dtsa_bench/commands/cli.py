@@ -20,7 +20,7 @@ INTERRUPTED = 128 + signal.SIGINT
 
 
 class HelpText(argparse.HelpFormatter):
-    """Fills paragraphs, but leaves examples as they are."""
+    """Fill paragraphs, but leave examples as they are."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return text if text.startswith("examples:") else super()._fill_text(text, width, indent)
@@ -119,7 +119,7 @@ def report(error: Exception) -> int:
 
 
 def _report_system(error: OSError) -> int:
-    """Says what the system refused; where standard output takes nothing more, not even the exit writes to it again."""
+    """Report what the system refused; where standard output takes nothing more, not even the exit writes to it again."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -234,14 +234,14 @@ def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
 
 
 def _report_missing_frames(summary: dict[str, Any]) -> bool:
-    """Says so if nobody has heard anybody, or most frames were of no use; whether it is so."""
+    """Warn if no agent has heard another one, or most frames were of no use; whether it is so."""
     if summary["unheard"]:
         print(f"dtsa: {summary['unheard']}", file=sys.stderr)
     return bool(summary["unheard"])
 
 
 def _print_result(args: argparse.Namespace, flight: Any) -> None:
-    """Prints what came of a flight."""
+    """Print what came of a flight."""
     if args.json:
         print(json.dumps(flight.summary, indent=2))
         return

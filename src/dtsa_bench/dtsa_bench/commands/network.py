@@ -35,14 +35,14 @@ _OPTIONS = {"policy": "policy", "auth": "seal"}  # settings whose options are ca
 
 
 def add_results(parser: argparse.ArgumentParser) -> None:
-    """Adds what carries the frames, and where the results go."""
+    """Add what carries the frames, and where the results go."""
     parser.add_argument("--air", choices=AIRS, help=f"what carries the frames [{AIRS[0]}]")
     parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of ports and swarm, and their file. A setting that several ports have is one option."""
+    """Add the options of ports and swarm, and their file. A setting that several ports have is one option."""
     parser.add_argument(
         "--swarm",
         metavar="FILE",

@@ -96,7 +96,7 @@ Other nodes follow it with use_sim_time:=true. Keys: space pauses and goes on, q
 
 
 def _poll(player: Player, pressed: Callable[[], str], start_ns: int, length_s: float) -> None:
-    """Does what keys say, and shows on a terminal where the player is."""
+    """Do what keys say, and show on a terminal where the player is."""
     for key in pressed():
         player.paused ^= key == " "
         player.stopped |= key in "qQ\x03"
@@ -208,7 +208,7 @@ _NICE = 10  # flights on this machine go first
 
 
 class Source(Protocol):
-    """Adds the moments of a run to a history, in a thread of its own."""
+    """Add the moments of a run to a history, in a thread of its own."""
 
     stopped: bool
 

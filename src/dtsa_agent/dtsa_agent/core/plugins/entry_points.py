@@ -102,7 +102,7 @@ class PluginSwarm(Swarm):
         return Guarded(registry.kind, name, registry.factory(name), self.config, agent)
 
     def _list_speakers(self) -> None:
-        """Notes the parts of each observer that may say something, with the size of it, in the frame's order."""
+        """Note the parts of each observer that may say something, with the size of it, in the frame's order."""
         policy, estimator = self.config.policy_row, self.config.estimator_row
         parts = ((self.policies, policy.own_bytes), (self.estimators, estimator.own_bytes))
         self._speakers = [

@@ -89,7 +89,7 @@ class Guarded:
         return velocity
 
     def estimated(self, *arrays: NDArray[np.float64], slot: int) -> None:
-        """Checks that what ``estimate`` has written is finite."""
+        """Check that what ``estimate`` has written is finite."""
         if not all(np.isfinite(array).all() for array in arrays):
             raise PluginError(f"{self.name}, estimate", f"wrote a number that is not finite in slot {slot}")
 

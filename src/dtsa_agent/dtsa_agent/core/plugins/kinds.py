@@ -69,7 +69,7 @@ class OwnFrameData(Protocol):
         """The bytes for the frame that this agent sends in a slot: exactly ``own_bytes`` of them."""
 
     def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
-        """Takes in what the same part of another agent has said, in a frame whose state the table has already."""
+        """Receive what the same part of another agent has said, in a frame whose state the table has already."""
 
     def slot_over(self, table: Table, slot: int, outcome: SlotOutcome) -> None:
         """A slot is over for this observer; collisions are silence to receivers that cannot tell."""
@@ -97,7 +97,7 @@ class Radio(Protocol):
     """The radio of an agent that is not bound to slots."""
 
     def send(self) -> bool:
-        """Begins to send the agent's frame, with its state at the start of the slot; False: it still sends another.
+        """Begin to send the agent's frame, with its state at the start of the slot; False: it still sends another.
 
         A radio that listens takes the frame, and begins when :meth:`CarrierSensing.sensed` says so.
         """
@@ -110,7 +110,7 @@ class UnslottedPolicy(Protocol):
     """
 
     def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
-        """Acts at an instant, first at 0, with the table of the slot's start; returns when to be called again, ns."""
+        """Act at an instant, first at 0, with the table of the slot's start; returns when to be called again, ns."""
 
 
 class CarrierSensing(UnslottedPolicy, Protocol):
@@ -139,7 +139,7 @@ class PacketRadio(Radio, Protocol):
         """As for all, with some bytes that precede the frame; ``to``: id of the only agent that takes it in, 0: all."""
 
     def say(self, note: bytes) -> bool:
-        """Begins to send a packet without a frame."""
+        """Begin to send a packet without a frame."""
 
     def frame(self) -> bytes:
         """The agent's frame, with its state at the start of the slot, for packets of the policy's own.
@@ -173,7 +173,7 @@ class Estimator(Protocol):
     needs_intent: ClassVar[bool] = False
 
     def estimate(self, table: Table, slot: int, step: int, position: Array, velocity: Array) -> None:
-        """Writes the estimates for control instant ``step`` of a slot into (3, N) arrays, m and m/s."""
+        """Write the estimates for control instant ``step`` of a slot into (3, N) arrays, m and m/s."""
 
 
 class Avoider(Protocol):

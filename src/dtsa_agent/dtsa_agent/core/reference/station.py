@@ -508,7 +508,7 @@ class Station:
         return following - (self.latest_lead_ns if must_decide else self.lead_ns)
 
     def step(self, now: Ns) -> tuple[Ns, Datagram]:
-        """Does one thing that is due; when to call again (not after now: at once), and what to send now."""
+        """Do one thing that is due; when to call again (not after now: at once), and what to send now."""
         datagram, due = b"", self._due_ns(now)
         if now < due:
             return due, b""

@@ -155,7 +155,7 @@ class ReferenceSwarm(Swarm):
             agent.sends = bool(self.sends[place])
 
     def _publish(self, place: int) -> None:
-        """Writes a table into the arrays."""
+        """Write a table into the arrays."""
         table = self.agents[place].table
         for name in ("position", "velocity", "intent"):
             getattr(self, f"sent_{name}")[place] = np.array([getattr(row, name) for row in table.rows]).T

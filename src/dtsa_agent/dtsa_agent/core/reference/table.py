@@ -104,7 +104,7 @@ class Table:
             self._digest_row(index)
 
     def learn(self, frame: Frame, sampled: int) -> None:
-        """Takes in the state that an agent has sent.
+        """Receive the state that an agent has sent.
 
         Whoever says c_r = 0 leaves A_p; where all know its target it is then taken to stand there, at rest.
         """

@@ -218,7 +218,7 @@ class Settings:
 
     @classmethod
     def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
-        """Builds settings from plain values by name; those that are left out keep their defaults.
+        """Build settings from plain values by name; those that are left out keep their defaults.
 
         :raises ConfigError: for unknown names and values that are not allowed.
         """
@@ -243,7 +243,7 @@ def build(cls: type[T], values: Mapping[str, Any]) -> T:
 
 
 def check(config: Any) -> None:
-    """Checks all settings of an object, in its ``__post_init__``, and stores what :meth:`Setting.check` gives."""
+    """Check all settings of an object, in its ``__post_init__``, and store what :meth:`Setting.check` gives."""
     for spec in settings_of(type(config)):
         if not spec.custom:
             value = getattr(config, spec.name)
@@ -293,7 +293,7 @@ def _checked_values(value: object, name: str) -> dict[str, float]:
 
 
 def parse_values(text: str) -> dict[str, float]:
-    """Reads ``name=number, name=number``; ValueError: it is not of this form."""
+    """Read ``name=number, name=number``; ValueError: it is not of this form."""
     result = {}
     for part in filter(None, (piece.strip() for piece in text.split(","))):
         name, equals, value = part.partition("=")

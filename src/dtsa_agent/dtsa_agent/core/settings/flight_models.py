@@ -66,7 +66,7 @@ class VehicleParams(Settings):
     a_max: float = setting(2.0, "largest acceleration (norm)", unit="m/s^2", minimum=0.01, maximum=200)
 
     def step(self, dt: float, position: Array, velocity: Array, command: Array) -> None:
-        """Moves vehicles, (3,) or (3, N), on by dt s, not longer than ``tau``: position and velocity in place."""
+        """Move vehicles, (3,) or (3, N), on by dt s, not longer than ``tau``: position and velocity in place."""
         p, v, c = (np.array(values, dtype=np.float64, order="C") for values in (position, velocity, command))
         if not p.shape == v.shape == c.shape or p.shape[0] != 3:
             raise ValueError(f"position, velocity, command: shapes {p.shape}, {v.shape} and {c.shape}")

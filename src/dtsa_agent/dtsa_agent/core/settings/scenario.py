@@ -100,7 +100,7 @@ class Course:
         return np.asarray(~self._moving | (self.leg == self._legs - 1))
 
     def advance(self, slot: int, position: Array) -> bool:
-        """Takes note of where the agents are, (3, L) m, when a slot begins; returns whether any goal has changed."""
+        """Note where the agents are, (3, L) m, when a slot begins; returns whether any goal has changed."""
         if position.shape != self.goal.shape:
             raise ValueError(f"position: shape {position.shape}")
         return bool(lib.course_advance(self.kernel, slot, memory(np.ascontiguousarray(position, dtype=np.float64))))
@@ -126,7 +126,7 @@ class Scenario:
         return None if self.plan is None else Course(self.plan, local)
 
     def advance(self, slot: int, swarm: Any) -> None:
-        """Sets goals and activity of a :class:`~dtsa_agent.core.swarm.Swarm` for the slot that is about to begin.
+        """Set goals and activity of a :class:`~dtsa_agent.core.swarm.Swarm` for the slot that is about to begin.
 
         Only the own state of each agent is looked at.
         """

@@ -258,7 +258,7 @@ def choose_lessee(memory: Memory, voters: Electorate, turn: int, but: int = -1) 
 def hand_on(
     memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leases: bytes
 ) -> list[int]:
-    """Hands on turns that the agent was given; not the next slot's: frames may arrive late.
+    """Hand on turns that the agent was given; not the next slot's: frames may arrive late.
 
     If it rests, all within reach that come before its last turn there, in which it can hand on further ones; beyond the
     relay's reach all to one agent, to whom the first of them is worth most. If it moves, those within the relay's reach

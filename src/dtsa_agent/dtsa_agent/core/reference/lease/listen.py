@@ -13,7 +13,7 @@ from .memory import DEAF, GONE, MISSED, NEVER, Memory
 
 
 def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: ExtendedFrame, wakes: bool) -> None:
-    """Takes in a frame of somebody else."""
+    """Receive a frame of another agent."""
     if not memory.started:
         return
     sender = frame.own.sender - 1

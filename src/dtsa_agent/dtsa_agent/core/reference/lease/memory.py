@@ -105,7 +105,7 @@ class Memory:
         return owner
 
     def note(self, self_index: int, slot: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
-        """Takes note of what a frame says of a turn.
+        """Note what a frame says of a turn.
 
         The lessee may hand the turn on, in a frame of its own; what is relayed later changes nothing. So a turn can
         come back to the agent itself, but not by an older frame than its own last one, which may not know what that
