@@ -77,7 +77,7 @@ def config(**settings: Any) -> SwarmConfig:
 
 
 def parts(swarm: Swarm, kind: str) -> list[Any]:
-    return [part.made for part in getattr(swarm, kind)]
+    return [part.instance for part in getattr(swarm, kind)]
 
 
 def fly(swarm: Swarm, slots: range, lost: tuple[int, int] | None = None) -> list[bytes]:

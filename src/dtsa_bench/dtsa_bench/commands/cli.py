@@ -119,7 +119,7 @@ def report(error: Exception) -> int:
 
 
 def _report_system(error: OSError) -> int:
-    """Report what the system refused; where standard output takes nothing more, not even the exit writes to it again."""
+    """Report what the system refused; where standard output takes no more, not even the exit writes to it."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -259,6 +259,8 @@ def table_text(table: SweepTable, width: int = 0, shown: Sequence[str] = SHOWN, 
             parts.append([*labels, *block])
     heads = [f"{MEASURES[name].head}: {label_of(name)}" for name in table.measured(shown) if MEASURES[name].head]
     legend = "; ".join(["out: flights that did not end as they should, left out of distances and times", *heads])
+    if width:
+        legend = textwrap.fill(legend, width, break_long_words=False, break_on_hyphens=False)
     return "\n\n".join([*(aligned(list(zip(*part, strict=True))) for part in parts), legend])
 
 

@@ -94,7 +94,7 @@ def test_latex_compiles_the_table(swept: dtsa.SweepResult, tmp_path: Path) -> No
 
 def test_the_terminal_shows_every_interval_whatever_its_width(table: SweepTable) -> None:
     wide = table_text(table)
-    assert len(wide.splitlines()) == 5
+    assert len(wide.splitlines()) == 7  # with the legend
     for width in (80, 120):
         text = table_text(table, width)
         assert max(map(len, text.splitlines())) <= width
