@@ -24,7 +24,7 @@ COMPILE_FLAGS = [
     "-Wno-psabi",  # vectors are passed between inlined functions only
 ]
 
-LIBRARY, SIMULATOR, SOCKETS = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/air/udp"
+LIBRARY, SIMULATOR, SOCKETS = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/air"
 # What Python sees of both: all that these headers declare, in the order in which they include each other.
 HEADERS = [
     f"{LIBRARY}/{name}.h" for name in ("include/dtsa", "include/dtsa_station", "frame", "core", "avoider/avoider")
@@ -71,8 +71,8 @@ setup(
             libraries=["m"],
         ),
         Extension(
-            "dtsa_agent.ros.common.workarounds._endless",
-            sources=["dtsa_agent/ros/common/workarounds/_endless.c"],
+            "dtsa_agent.ros.common._endless",
+            sources=["dtsa_agent/ros/common/_endless.c"],
             py_limited_api=True,
         ),
     ],

@@ -21,7 +21,7 @@ from dtsa_dev.network.switch import Intruder, Links, Switch
 from trials import Trial, TrialError, flight_time, under_way
 
 import dtsa
-from dtsa_agent.air.datagram import link_of
+from dtsa_agent.air.port import link_of
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.station import StationSettings
 from dtsa_bench.log.merge.merge import Merge, verified

@@ -82,7 +82,7 @@ class OwnClocks:
         heapq.heappush(self._events, (max(now + 1, to_channel(clock, due)), k))
 
     def _deliver(self, now: int) -> None:
-        for verdict in self._air.settle(now):
+        for verdict in self._air.resolve(now):
             data = self._data.pop(verdict.frame_id)
             if verdict.collided:
                 self.collided.append(verdict.start_ns)

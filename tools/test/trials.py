@@ -23,7 +23,7 @@ from dtsa_dev.network.fake_modems import FakeModems, FakeModemSettings
 from dtsa_dev.network.hosts import CABLE, EmulatedHost, hosts
 from dtsa_dev.network.switch import Links, Switch
 
-from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.port import HEADER
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import VARIABLE

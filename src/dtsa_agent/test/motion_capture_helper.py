@@ -15,8 +15,7 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
 
-from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
 from dtsa_bench.crazyflies.simulated import cli, process, world
 from dtsa_bench.crazyflies.simulated.estimate import Estimate
 from dtsa_bench.crazyflies.simulated.fleet import Fleet

@@ -18,9 +18,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from waiting import wait_for
 
-from dtsa_agent.ros.common.process.loop import Serving
-from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_agent.ros.common.loop import ExecutorThread
+from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
 from dtsa_bench.flights.domain import ros_domain
 
 PATIENCE_S = 120.0
@@ -85,7 +84,7 @@ class ServedNode:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         self.node = _made(domain, name)
         self._clients: dict[str, Client] = {}
-        self._serving = Serving(self.node.context, name, self.node)
+        self._serving = ExecutorThread(self.node.context, name, self.node)
         self._serving.start()
 
     def client(self, kind: Any, name: str) -> Client:

@@ -13,7 +13,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common import names
 
 
 def _nodes(context: LaunchContext) -> list[Node]:

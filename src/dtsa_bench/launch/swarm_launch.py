@@ -18,9 +18,8 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.settings.declaration import settings_of
-from dtsa_agent.ros.common.graph import names
-from dtsa_bench.flights.agents import agent_processes, process_count
-from dtsa_bench.flights.options import FlightOptions
+from dtsa_agent.ros.common import names
+from dtsa_bench.flights.options import FlightOptions, agent_processes, process_count
 from dtsa_bench.runs.config import FROM_SWARM, MODES, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.options import whole_number
 from dtsa_channel_sim import ChannelConfig, ClockConfig

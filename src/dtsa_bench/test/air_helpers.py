@@ -18,11 +18,10 @@ import pytest
 from waiting import wait_for
 
 from dtsa_agent.air.driver import LiveAgent
-from dtsa_agent.air.port import PortSettings
-from dtsa_agent.air.ports import open_port
+from dtsa_agent.air.port import PortSettings, open_port
 from dtsa_agent.air.record import SlotRecord
-from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import UdpPort, UdpSettings
+from dtsa_agent.air.settings import AgentSettings, UdpSettings
+from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
 from dtsa_bench.log.agent_bag import AgentRecorder, read
@@ -63,7 +62,7 @@ class Flying:
     def __init__(self, own: AgentSettings, config: SwarmConfig, settings: PortSettings, path: Path) -> None:
         self.port = open_port(settings)
         self.said: list[str] = []  # in flight
-        self.agent = LiveAgent(own, config, self.port, say=self.said.append)
+        self.agent = LiveAgent(own, config, self.port, log=self.said.append)
         self.recorder = AgentRecorder(path, own, config, settings)
         self.agent.watcher = self
         self.stop = Stop()
@@ -74,15 +73,15 @@ class Flying:
         self._thread.start()
 
     def slot(self, record: SlotRecord) -> None:
-        if record.anew:
+        if record.is_first:
             self.heard.clear()
         self.heard.update(frame.sender for frame in record.heard)
         self.slots.append(record.slot)
         self.speed = math.sqrt(float(record.velocity @ record.velocity))
         self.recorder.slot(record)
 
-    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
-        self.recorder.other(reason, data, arrival_ns)
+    def refused(self, reason: str, data: bytes, arrival_ns: int) -> None:
+        self.recorder.refused(reason, data, arrival_ns)
 
     def _run(self) -> None:
         with self.recorder, self.port:

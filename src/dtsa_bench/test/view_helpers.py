@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from bag_helpers import flight_bag
 
-from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
+from dtsa_agent.ros.common.cdr import split_frames, unpack_received
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.record import SLOT_RECORD
 from dtsa_bench.pages.view.follower import Follower

@@ -10,24 +10,7 @@ from dtsa_channel_sim.model.topology import LinkLoss
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
 
 __all__ = [
-    "CHANGEABLE",
-    "COLLISION",
-    "IDLE",
-    "OUTCOMES",
-    "SUCCESS",
-    "AgentClock",
-    "Air",
-    "Airtime",
-    "Change",
-    "Channel",
-    "ChannelConfig",
-    "ClockConfig",
-    "FrameVerdict",
-    "LinkLoss",
-    "MeasuredLosses",
-    "Medium",
-    "OnAir",
-    "Reception",
-    "Verdict",
-    "make_clocks",
-]
+    "CHANGEABLE", "COLLISION", "IDLE", "OUTCOMES", "SUCCESS", "AgentClock", "Air", "Airtime", "Change", "Channel",
+    "ChannelConfig", "ClockConfig", "FrameVerdict", "LinkLoss", "MeasuredLosses", "Medium", "OnAir", "Reception",
+    "Verdict", "make_clocks",
+]  # fmt: skip

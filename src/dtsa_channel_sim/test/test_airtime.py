@@ -1,9 +1,8 @@
 """Radios by name: the times of their lines, and the shortest slots that follow."""
 
-from dtsa_agent.air.datagram import flight_ns
-from dtsa_agent.air.serial.lengths import HEADER, LONGEST
-from dtsa_agent.air.serial.modems import MODEMS
-from dtsa_agent.air.serial.settings import SerialSettings
+from dtsa_agent.air.port import flight_ns
+from dtsa_agent.air.serial_modems import HEADER, LONGEST, MODEMS
+from dtsa_agent.air.settings import SerialSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_channel_sim.model.airtime import RADIOS, Airtime, Line, RadioRow, airtime_of
 

@@ -16,9 +16,9 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Report
 from rclpy.serialization import serialize_message
 
-from dtsa_agent.ros.common.wire.checks import Unusable
-from dtsa_agent.ros.common.wire.messages import Fields, read_report
-from dtsa_channel_sim.ros.answers import Accounts, Delivered
+from dtsa_agent.ros.common.checks import BadMessage
+from dtsa_agent.ros.common.messages import Fields, read_report
+from dtsa_channel_sim.ros.answers import Accounts, DeliveredFrame
 
 AGENTS, STEPS, LATEST = 5, 1, 50
 IDS, SLOTS = (2, 3), (7, 8)
@@ -43,7 +43,7 @@ def accounts() -> Accounts:
     """Accounts in which the frame of agent 1 in slot 6 was delivered to agent 2 alone."""
     made = Accounts(AGENTS, STEPS, keep=100)
     received = np.array([False, True, False, False, False])
-    made.deliver(6, 1, Delivered(b"frame", 61_000_000, received))
+    made.deliver(6, 1, DeliveredFrame(b"frame", 61_000_000, received))
     return made
 
 
@@ -52,7 +52,7 @@ def test_a_report_fills_accounts_and_only_what_was_delivered_counts_as_taken_in(
     assert made.add(report(), LATEST) == 8
     assert made.silent(7) == [1, 4, 5]
     assert made[8].position[:, 1].tolist() == [1.0, 1.0, 1.0]
-    (taken,) = made.taken_in(7)
+    (taken,) = made.receipts(7)
     assert taken.at_ns.tolist() == [-1, 70_000_000, -1, -1, -1]
     made.close(7)
     assert made.add(report(), LATEST) == -1  # slot 7 is over, slot 8 is told twice
@@ -71,11 +71,11 @@ def test_a_report_fills_accounts_and_only_what_was_delivered_counts_as_taken_in(
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_and_changes_nothing(field: str, values: Any, reason: str) -> None:
     made = accounts()
-    with pytest.raises(Unusable) as caught:
+    with pytest.raises(BadMessage) as caught:
         made.add(report(**{field: values}), LATEST)
     assert caught.value.reason == reason
     assert made.silent(7) is None
-    assert made.taken_in(7) == []
+    assert made.receipts(7) == []
 
 
 @given(
@@ -89,8 +89,8 @@ def test_no_report_does_anything_but_fit_or_be_refused(changed: dict[str, list[i
     kinds = {"agent": "H", "slot": "I", "offset_ns": "q", "chosen": "H", "track": "d", "goal": "d", "heard_slot": "I"}
     fields = {name: array(kinds.get(name, "B"), values) for name, values in changed.items()}
     made = accounts()
-    with suppress(Unusable):  # any other error would end the channel
+    with suppress(BadMessage):  # any other error would end the channel
         made.add(report(**fields), LATEST)
     for slot in range(LATEST + 1):
-        made.taken_in(slot)
+        made.receipts(slot)
         made.close(slot)

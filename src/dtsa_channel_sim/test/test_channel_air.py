@@ -34,7 +34,7 @@ def test_order_and_rhythm_do_not_matter(frames, order, step, radio):
     at_once, stepwise = (arbiter(loss=0.2, seed=4, radio=radio) for _ in range(2))
     for frame in frames:
         at_once.begin(*frame)
-    expected = summary(at_once.settle(60 * MS))
+    expected = summary(at_once.resolve(60 * MS))
     assert len(expected) == len(frames)
     assert at_once.pending == 0
     # Now in random order, each frame just in time for the settling that needs it.
@@ -45,7 +45,7 @@ def test_order_and_rhythm_do_not_matter(frames, order, step, radio):
         for frame in frames:
             if now - step <= frame[2] < now:
                 stepwise.begin(*frame)
-        result += summary(stepwise.settle(now))
+        result += summary(stepwise.resolve(now))
     assert stepwise.late == 0
     # Frames of equal end, start and sender aside, the order of verdicts is that of the ends, too.
     assert sorted(result) == sorted(expected)
@@ -58,7 +58,7 @@ def test_against_overlap_by_pairs(frames):
     airtime = Channel(ChannelConfig(agents=6)).config.airtime
     for i, frame in enumerate(frames):
         line.begin(i, *frame)
-    for verdict in line.settle(60 * MS):
+    for verdict in line.resolve(60 * MS):
         sender, start, length = frames[verdict.frame_id]
         first, last = start + airtime.ramp_up_ns, start + airtime.total_ns(length)
         bad = {sender}
@@ -97,7 +97,7 @@ def test_slots_are_transmissions_that_start_together(slots, medium, seed, length
         by_slot = channel.arbitrate(slot, senders, [length] * len(senders), places)
         for sender in senders:
             line.begin((slot, sender), sender, slot * config.slot_ns, length)
-        verdicts = {v.sender: v for v in line.settle((slot + 1) * config.slot_ns, places)}
+        verdicts = {v.sender: v for v in line.resolve((slot + 1) * config.slot_ns, places)}
         assert sorted(verdicts) == sorted(senders)
         mask = by_slot.mask(6)
         for row, sender in enumerate(senders):
@@ -121,7 +121,7 @@ def test_a_radio_senses_what_would_destroy_a_frame_there(frames, when, listener,
     for i, (sender, start, length) in enumerate(frames):
         line.begin(i, sender, start, length)
         others.append(OnAir.of(channel.config.airtime, sender, start, length))
-    probe = channel.medium(0).judge(0, OnAir(7, when, when, when + 1), others, places)
+    probe = channel.medium(0).resolve(0, OnAir(7, when, when, when + 1), others, places)
     assert line.busy(listener, when, places) != probe.received[listener - 1]
 
 
@@ -131,7 +131,7 @@ def test_a_frame_is_not_sensed_before_its_first_bit_and_not_after_its_last():
     times = [1 * MS - 1, 1 * MS, 1_129_999, 1_130_000, 1_270_499, 1_270_500]
     assert [line.busy(2, when) for when in times] == [False, False, False, True, True, False]
     assert [line.busy(1, when) for when in times] == [False, True, True, True, True, False]
-    line.settle(2 * MS)
+    line.resolve(2 * MS)
     with pytest.raises(LocalProtocolError):
         line.busy(2, 1 * MS)
 
@@ -139,11 +139,11 @@ def test_a_frame_is_not_sensed_before_its_first_bit_and_not_after_its_last():
 def test_late_frames_are_dropped_and_counted():
     line = arbiter()
     line.begin(0, 1, 0, 24)
-    (first,) = line.settle(1 * MS)
+    (first,) = line.resolve(1 * MS)
     assert first.received.sum() == 5
     assert not line.begin(1, 2, 100_000, 24)
     assert line.begin(2, 3, 1 * MS, 24)
-    (third,) = line.settle(2 * MS)
+    (third,) = line.resolve(2 * MS)
     assert third.frame_id == 2
     assert third.collided == 0
     assert line.late == 1
@@ -154,7 +154,7 @@ def test_memory_does_not_grow():
     line = arbiter()
     for slot in range(500):
         line.begin(slot, slot % 6 + 1, slot * MS, 60)
-        line.settle(slot * MS)
+        line.resolve(slot * MS)
     assert len(line._near) < 5
     assert line.pending < 5
 
@@ -167,7 +167,7 @@ def test_changes_in_flight_begin_with_the_next_slot():
         if slot == 4:
             assert channel.set(jam=True).slot == 4
         line.begin(slot, 1, slot * 10 * MS + 1, 24)
-        received += [int(v.received.sum()) for v in line.settle((slot + 1) * 10 * MS - 1)]
+        received += [int(v.received.sum()) for v in line.resolve((slot + 1) * 10 * MS - 1)]
     assert received == [5, 5, 5, 5, 0, 0, 0, 0, 0, 0]
 
 
@@ -192,7 +192,7 @@ def test_frames_that_touch_do_not_collide(gap, collided):
     assert first.deafens(second) == bool(collided)
     for frame in (second, first):
         line.begin(frame.sender, frame.sender, frame.start_ns, 24)
-    verdicts = {v.sender: v for v in line.settle(60 * MS)}
+    verdicts = {v.sender: v for v in line.resolve(60 * MS)}
     assert verdicts[1].collided == 1 + collided
     assert verdicts[2].collided == (5 if collided else 0)
 

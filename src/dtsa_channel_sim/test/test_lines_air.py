@@ -24,7 +24,7 @@ def test_an_own_frame_waits_while_its_radio_hands_a_reception_over(later_ns, wai
     air = line()
     air.begin("heard", 1, 0, 56)
     air.begin("own", 2, TOTAL + later_ns, 56)
-    verdicts = {v.frame_id: v for v in air.settle(10 * MS)}
+    verdicts = {v.frame_id: v for v in air.resolve(10 * MS)}
     assert verdicts["own"].start_ns == TOTAL + later_ns + waits_ns
     # Handed over a moment earlier it cuts the reception instead.
     assert verdicts["heard"].received[1] == (later_ns >= 0)
@@ -37,7 +37,7 @@ def test_an_own_frame_goes_before_the_next_reception_and_that_one_waits_for_noth
     air.begin("first", 1, 0, 56)
     air.begin("second", 2, second, 20)
     air.begin("own", 3, TOTAL + 1, 56)
-    verdicts = {v.frame_id: v for v in air.settle(10 * MS)}
+    verdicts = {v.frame_id: v for v in air.resolve(10 * MS)}
     assert verdicts["first"].received.tolist() == [False, False, True]  # agent 2 turned to sending
     ends = second + AIRTIME.total_ns(20)
     assert ends < TOTAL + BACK
@@ -50,7 +50,7 @@ def test_a_radio_sends_its_own_frames_one_after_the_other():
     air = line()
     for frame_id, at_ns in (("one", 0), ("two", 10), ("three", 20)):
         air.begin(frame_id, 1, at_ns, 56)
-    verdicts = air.settle(10 * MS)
+    verdicts = air.resolve(10 * MS)
     assert [(v.frame_id, v.start_ns, v.collided) for v in verdicts] == [
         ("one", 0, 0), ("two", TOTAL, 0), ("three", 2 * TOTAL, 0),
     ]  # fmt: skip
@@ -62,7 +62,7 @@ def test_no_frame_takes_longer_than_the_latest_time():
     air = line()
     for k in range(200):
         air.begin(k, k % 6 + 1, k * 300_000, 56)
-    for verdict in air.settle(1000 * MS):
+    for verdict in air.resolve(1000 * MS):
         assert verdict.arrival_ns - verdict.start_ns <= TOTAL + 8 * BACK
 
 
@@ -75,7 +75,7 @@ def test_a_radio_holds_eight_receptions_and_loses_the_ninth():
     air, bits = line(agents=21, link_loss=[deaf]), AIRTIME.on_air_ns(56)
     for k in range(20):
         air.begin(k, k + 1, k * bits, 56)
-    verdicts = air.settle(100 * MS)
+    verdicts = air.resolve(100 * MS)
     at_last = [bool(v.received[20]) for v in verdicts]
     through: list[int] = []
     for k, verdict in enumerate(verdicts):  # a queue by hand
@@ -103,7 +103,7 @@ def test_slots_that_are_long_enough_know_nothing_of_the_line(slots, seed):
             for sender in senders:
                 air.begin((slot, sender), sender, slot * slot_ns, 56)
     one, other = (
-        [(v.frame_id, v.start_ns, v.received.tolist(), v.lost, v.collided) for v in air.settle(100 * MS)]
+        [(v.frame_id, v.start_ns, v.received.tolist(), v.lost, v.collided) for v in air.resolve(100 * MS)]
         for air in (plain, true)
     )
     assert one == other
@@ -116,7 +116,7 @@ def test_a_radio_that_waits_begins_and_is_sensed_later():
     begins = TOTAL + BACK + AIRTIME.ramp_up_ns
     assert not air.busy(3, begins - 1)
     assert air.busy(3, begins)
-    assert [v.frame_id for v in air.settle(10 * MS)] == ["heard", "own"]
+    assert [v.frame_id for v in air.resolve(10 * MS)] == ["heard", "own"]
 
 
 def test_what_a_crazyflie_cannot_send_is_refused():
@@ -125,4 +125,4 @@ def test_what_a_crazyflie_cannot_send_is_refused():
     air = line()
     with pytest.raises(LocalProtocolError, match="length 61: a frame has 1 to 60 bytes"):
         air.begin(0, 1, 0, 61)
-    assert np.array_equal(air.settle(MS), [])
+    assert np.array_equal(air.resolve(MS), [])

@@ -21,9 +21,10 @@ from rclpy.node import Node
 from std_msgs.msg import UInt32
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.loop import Loop, Stop
-from dtsa_agent.ros.common.process.node_process import init_ros, node_options, run_node
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Loop
+from dtsa_agent.ros.common.node_process import init_ros, node_options, run_node
+from dtsa_agent.stop import Stop
 from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.domain import ros_domain

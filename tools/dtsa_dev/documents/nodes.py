@@ -24,7 +24,7 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.crazyflie.node import agents_node
 from dtsa_agent.ros import agent_node, swarm_host
-from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.stop import Stop
 from dtsa_bench.flights import recorded_channel
 from dtsa_bench.flights.domain import ros_domain
 from dtsa_bench.flights.flight import run_environment

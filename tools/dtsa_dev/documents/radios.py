@@ -7,10 +7,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import dtsa
-from dtsa_agent.air.crazyradio.settings import CrazyradioSettings
-from dtsa_agent.air.datagram import shortest_slot_ns
-from dtsa_agent.air.serial.modems import MODEMS, NONE
-from dtsa_agent.air.serial.settings import SerialSettings
+from dtsa_agent.air.port import shortest_slot_ns
+from dtsa_agent.air.serial_modems import MODEMS, NONE
+from dtsa_agent.air.settings import CrazyradioSettings, SerialSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_channel_sim.model.airtime import RADIOS
 

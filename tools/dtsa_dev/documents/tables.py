@@ -13,12 +13,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.crazyradio.settings import CrazyradioSettings
-from dtsa_agent.air.serial.lengths import FRAMING
-from dtsa_agent.air.serial.modems import MODEMS, NONE
-from dtsa_agent.air.serial.settings import SerialSettings
-from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp.settings import UdpSettings
+from dtsa_agent.air.serial_modems import FRAMING, MODEMS, NONE
+from dtsa_agent.air.settings import AgentSettings, CrazyradioSettings, SerialSettings, UdpSettings
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Setting, Settings, settings_of

@@ -20,7 +20,7 @@ from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.serial.modems import MODEMS, Modem
+from dtsa_agent.air.serial_modems import MODEMS, Modem
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.medium import OnAir
 
@@ -271,7 +271,7 @@ class FakeModems:
             if each is not frame and each.start_ns < frame.end_ns and each.end_ns > frame.start_ns
         ]
         slot = self._slot(frame.start_ns)
-        received, lost, collided = self._channel.medium(slot).judge(slot, frame, others)
+        received, lost, collided = self._channel.medium(slot).resolve(slot, frame, others)
         self._channel.advance(slot)
         self.counts["lost"] += lost
         self.counts["collided"] += collided

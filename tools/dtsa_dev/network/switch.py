@@ -20,9 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dtsa_agent.air.datagram import HEADER
-from dtsa_agent.air.process import wake_precisely
+from dtsa_agent.air.port import HEADER
 from dtsa_agent.core.frame import named_in
+from dtsa_agent.priority import wake_precisely
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
 from .hosts import EmulatedHost, arrived
@@ -36,7 +36,7 @@ _FLOOD = 20  # frames at a time, now and then
 
 
 @dataclass(frozen=True, slots=True)
-class CarriedDatagram:
+class OnAir:
     """A datagram that was on the air."""
 
     start_ns: int  # since the switch began
@@ -59,7 +59,7 @@ class Links:
 
 
 class Switch:
-    """Join hosts."""
+    """Joins hosts."""
 
     def __init__(
         self, joined: Sequence[EmulatedHost], group: tuple[str, int], config: ChannelConfig, links: Links | None = None
@@ -76,7 +76,7 @@ class Switch:
         self._due: list[tuple[int, int, int, bytes]] = []  # deliveries: when, number, cable, Ethernet frame: a heap
         self._count = 0
         self._zero = time.monotonic_ns()
-        self.log: list[CarriedDatagram] = []
+        self.log: list[OnAir] = []
         #: Is told each Ethernet frame that has left the air.
         self.listener: Callable[[bytes], None] | None = None
         self.left_out = 0  # Ethernet frames that were nothing for the air
@@ -88,7 +88,7 @@ class Switch:
         return time.monotonic_ns() - self._zero
 
     def set(self, **values: object) -> None:
-        """Change the medium from the next slot on."""
+        """Changes the medium from the next slot on."""
         self.channel.set(**values)
 
     def run(self, until: Callable[[], bool], seconds: float) -> bool:
@@ -134,7 +134,7 @@ class Switch:
         return packet[head + 8 : head + int.from_bytes(packet[head + 4 : head + 6], "big")]
 
     def _resolve(self, until_ns: int) -> None:
-        for verdict in self._air.settle(until_ns):
+        for verdict in self._air.resolve(until_ns):
             frame, agent, slot = self._frames.pop(verdict.frame_id)
             numbers = [int(k) + 1 for k in np.flatnonzero(verdict.received) if int(k) + 1 in self._cables]
             for number in numbers:
@@ -145,7 +145,7 @@ class Switch:
                     entry = (verdict.arrival_ns + delay, self._count, self._cables[number], frame)
                     heapq.heappush(self._due, entry)
             self.log.append(
-                CarriedDatagram(
+                OnAir(
                     verdict.start_ns, verdict.end_ns, verdict.sender, agent, slot, len(numbers), verdict.lost,
                     verdict.collided,
                 )

@@ -147,7 +147,7 @@ def main(topic: str, kind: str) -> None:
     from rclpy.qos import QoSProfile
     from rclpy.serialization import serialize_message
 
-    from dtsa_agent.ros.common.wire.packing import RUN_BYTES
+    from dtsa_agent.ros.common.cdr import RUN_BYTES
 
     module, name = _TYPES[topic]
     message_type = getattr(importlib.import_module(module), name)

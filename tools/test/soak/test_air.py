@@ -16,7 +16,7 @@ from dtsa_dev.network.hosts import why_not
 from dtsa_dev.network.switch import Intruder, Links
 from trials import WHOLE, Trial, apart, fly
 
-from dtsa_agent.air.datagram import NETWORK
+from dtsa_agent.air.port import NETWORK
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.log.record import load_log
 

@@ -17,92 +17,78 @@ from .port import ClockMap, PortProperties, ReceivedDatagram
 
 _END_S = 2.0  # a device that hangs ends with the process
 _ROOM = 256  # datagrams that wait for the agent
-_LOOK_S = 0.5  # between two looks whether a device that has gone is back
+_RETRY_S = 0.5  # from one attempt to open a device that has gone to the next
 
 
 class DeviceError(Exception):
-    """A device has gone, or does not take what it is given; the text says why."""
+    """A device has gone, or refuses what it is given; the text says why."""
 
 
-class Device(Protocol):
-    """What is open while it is there."""
+class OpenDevice(Protocol):
+    """A device while it is open."""
 
     def close(self) -> None:
-        """Gives it back."""
+        """Free it for others."""
 
 
-D = TypeVar("D", bound=Device)
+D = TypeVar("D", bound=OpenDevice)
 
 
 class DevicePort(ABC, Generic[D]):
-    """A :class:`.port.DatagramPort` and a :class:`.port.Listener`; the thread is started by :meth:`begin`.
+    """A :class:`.port.DatagramPort`; a device that is unplugged is used again when it is back.
 
-    A device that is unplugged is used again when it is back.
-
-    :param name: what it is called in what it says, as "device /dev/ttyUSB0".
+    :param name: for log lines, as "device /dev/ttyUSB0".
     :param kind: what it is, as "device".
-    :param properties: see there.
-    :param device: open already.
     """
 
-    def __init__(self, name: str, kind: str, properties: PortProperties, device: D) -> None:
+    def __init__(self, name: str, kind: str, properties: PortProperties) -> None:
         self.properties = properties
-        self.say: Callable[[str], None] | None = None  # is told a line when the device goes, and when it is back
-        self._arrived: deque[ReceivedDatagram] = deque()
-        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)  # readable while something waits
+        self.log: Callable[[str], None] | None = None
         self.overflowed = 0  # datagrams for which there was no room
+        self.unplugged = 0  # how often the device has gone
+        self._device: D | None = self._open()
+        self._arrived: deque[ReceivedDatagram] = deque()
+        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)  # readable while a datagram waits
         self._name, self._missing = name, f"the {kind} is not there"
-        self._device: D | None = device
-        self._unplugged = 0
         self._lock = threading.Lock()  # the thread that reads closes the device, another one writes to it
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name=kind, daemon=True)
-
-    def begin(self) -> None:
-        """Begins to read: all that a reader needs is there."""
         self._thread.start()
-
-    # What differs.
 
     @abstractmethod
     def _open(self) -> D:
-        """The device anew.
+        """Open the device.
 
-        :raises ConfigError: if it is not back yet.
+        :raises ConfigError: if it is not there, or cannot be used.
         """
 
     @abstractmethod
     def _write(self, device: D, data: bytes) -> None:
-        """Hands it a datagram.
+        """Hand it a datagram.
 
-        :raises DeviceError: if it does not take it.
+        :raises DeviceError: if it refuses it.
         """
 
     @abstractmethod
     def _read(self, device: D) -> None:
-        """Reads until it is stopped.
+        """Read until stopped.
 
         :raises DeviceError: if the device goes.
         """
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
-        """What it counts, by name."""
+        """Return what it counts, by name."""
 
     def _lost(self) -> None:
         """The device has gone."""
-
-    # What is the same.
 
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
         return self._event
 
     def send(self, data: bytes) -> str:
-        """Hands a datagram to the device; why that was not possible, or an empty text.
-
-        :param data: the datagram.
-        """
+        """Hand a datagram to the device; return why that was not possible, or an empty text."""
         with self._lock:
             if self._device is None:
                 return self._missing
@@ -113,26 +99,26 @@ class DevicePort(ABC, Generic[D]):
         return ""
 
     def receive(self, most: int) -> list[ReceivedDatagram]:
-        """What has arrived, in this order, so many at most; empty if nothing has."""
+        """Return what has arrived, in this order, at most so many; empty if nothing has."""
         if not self._arrived:
             return []
         with suppress(BlockingIOError):
             os.eventfd_read(self._event)
-        found = [self._arrived.popleft() for _ in range(min(most, len(self._arrived)))]
+        datagrams = [self._arrived.popleft() for _ in range(min(most, len(self._arrived)))]
         if self._arrived:
             os.eventfd_write(self._event, 1)
-        return found
+        return datagrams
 
     def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
-        """Hand what has arrived, but for its own, to a station; returns how many datagrams have, so many at most."""
-        found = self.receive(most)
-        for one in found:
-            if not one.own:
-                station.receive(one.data, clock.local_ns(one.arrival_ns))
-        return len(found)
+        """Hand what others have sent to a station; return how many datagrams have arrived, at most so many."""
+        datagrams = self.receive(most)
+        for datagram in datagrams:
+            if not datagram.own:
+                station.receive(datagram.data, clock.local_ns(datagram.arrival_ns))
+        return len(datagrams)
 
-    def _put(self, data: bytes, arrival_ns: int, own: bool) -> None:
-        """The thread that reads has found a datagram."""
+    def _queue(self, data: bytes, arrival_ns: int, own: bool) -> None:
+        """Keep a datagram that the thread has read for the agent."""
         if len(self._arrived) >= _ROOM:
             self.overflowed += 1
             return
@@ -142,38 +128,32 @@ class DevicePort(ABC, Generic[D]):
     def _run(self) -> None:
         while not self._stopped.is_set():
             device = self._device
-            if device is None:
-                if not self._stopped.wait(_LOOK_S):
-                    self._come_back()
-                continue
-            try:
-                self._read(device)
-            except DeviceError as error:
-                self._go(device, str(error))
+            if device is not None:
+                try:
+                    self._read(device)
+                except DeviceError as error:
+                    self._drop(device, str(error))
+            elif not self._stopped.wait(_RETRY_S):
+                with suppress(ConfigError):  # it is not there yet
+                    device = self._open()
+                    with self._lock:
+                        self._device = device
+                    self._print("is back")
 
-    def _go(self, device: D, why: str) -> None:
-        with self._lock:  # nobody writes to it any more
+    def _drop(self, device: D, why: str) -> None:
+        with self._lock:  # nothing writes to it any more
             self._device = None
         device.close()  # this may take its time: no agent waits for it
         self._lost()
-        self._unplugged += 1
-        self._tell(f"has gone ({why}): no frame leaves or arrives until it is back")
+        self.unplugged += 1
+        self._print(f"has gone ({why}): no frame leaves or arrives until it is back")
 
-    def _come_back(self) -> None:
-        try:
-            device = self._open()
-        except ConfigError:  # not yet
-            return
-        with self._lock:
-            self._device = device
-        self._tell("is back")
-
-    def _tell(self, what: str) -> None:
-        if self.say is not None:
-            self.say(f"{self._name} {what}")
+    def _print(self, text: str) -> None:
+        if self.log is not None:
+            self.log(f"{self._name} {text}")
 
     def close(self) -> None:
-        """Ends the thread; the device is free for others."""
+        """End the thread, and free the device for others."""
         self._stopped.set()
         self._thread.join(_END_S)
         if self._device is not None:

@@ -1,4 +1,4 @@
-"""One live agent: a station, connected with a clock, a port and a vehicle. What it does itself is wait.
+"""One live agent: a station, connected with a clock, a port and a vehicle.
 
 The rules are the station's (``core.station``). The loop sleeps until the station is due, hands in what has arrived,
 sends what the station gives, and flies the vehicle.
@@ -19,23 +19,36 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, Station, StationSettings, check_joinable
+from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.keys import authenticator, check_session
+from dtsa_agent.priority import realtime_thread, wake_precisely
 from dtsa_agent.stop import Stop
 
-from .datagram import check_fits, late_in, link_of
-from .port import ClockMap, DatagramPort
-from .process import going_first, wake_precisely
-from .record import Heard, SlotRecord, Watcher
+from .port import ClockMap, DatagramPort, check_fits, lateness_ns, link_of
+from .record import AgentCounts, ReceivedFrame, SlotRecord, Watcher
 from .reports import Reports
 from .settings import AgentSettings
-from .tally import Tally
-from .vehicle import SimulatedVehicle, Vehicle
 
 _SECOND = 1_000_000_000
 _SIGNAL_POLL_S = 0.05  # a signal is noticed after this time at the latest
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
-_LOOK_NS = 100_000_000  # from one look at the station's status to the next
+_STATUS_NS = 100_000_000  # from one check of the station's status to the next
 _BURST = 16  # datagrams that are read at a time: whatever comes, the own slots go on
+
+
+class AgentVehicle:
+    """The vehicle of one agent: the point mass of the simulator, unless a subclass flies another one."""
+
+    def is_ready(self) -> bool:
+        """Whether it is known where the vehicle is: the agent listens and sends only from then on."""
+        return True
+
+    def sense(self, swarm: Swarm) -> None:
+        """Write where the vehicle is, and how it moves, into its agent, between two slots."""
+
+    def fly(self, swarm: Swarm, slot: int) -> None:
+        """Fly through a slot, after the agent has decided."""
+        swarm.fly(slot)
 
 
 class LiveAgent:
@@ -44,23 +57,18 @@ class LiveAgent:
     :param own: this agent.
     :param config: the settings that all agents share.
     :param port: what carries its datagrams; the caller keeps it open while the agent flies.
-    :param watcher: is told what happens; None: nobody is.
+    :param watcher: follows what happens; None: nothing does.
     :param vehicle: what it flies; None: a simulated one.
-    :param say: prints a line in flight; None: nothing is printed.
-    :param show: shows a line in place of the one before; None: nobody looks.
+    :param log: prints a line in flight; None: nothing is printed.
+    :param show: shows a line in place of the one before; None: nothing is shown.
     :raises ConfigError: for an id or a policy that cannot fly here, or a missing key or session.
     """
 
     def __init__(
-        self,
-        own: AgentSettings,
-        config: SwarmConfig,
-        port: DatagramPort,
-        watcher: Watcher | None = None,
-        vehicle: Vehicle | None = None,
-        say: Callable[[str], None] | None = None,
+        self, own: AgentSettings, config: SwarmConfig, port: DatagramPort, watcher: Watcher | None = None,
+        vehicle: AgentVehicle | None = None, log: Callable[[str], None] | None = None,
         show: Callable[[str], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if own.id > config.agents:
             raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
         check_joinable(config.policy)
@@ -71,43 +79,43 @@ class LiveAgent:
         self._settings = StationSettings(config, link, authenticator(config), own.id, own.quorum)
         self.swarm = make_swarm(config, local=[own.id])
         self.clock = ClockMap(own.clock_offset_ns, own.clock_drift_ppb)
-        self._layout = port.properties.header(config.auth) if port.properties.varies else None
-        self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
+        self._header = port.properties.header(config.auth) if port.properties.varies else None
+        self._vehicle = vehicle or AgentVehicle()
         self.station = self._start()
         self.slot = -1  # the present slot
-        self.tally = Tally()
-        port.say = say
-        self._reports = Reports(own.id, config.slot_ms, say, time.monotonic_ns(), show)
-        self._next_look_ns = 0
+        self.counts = AgentCounts()
+        port.log = log
+        self._reports = Reports(own.id, config.slot_ms, log, time.monotonic_ns(), show)
+        self._status_due_ns = 0
         self._flight_ns = link.flight_ns
-        self._says_leaving = config.policy_row.says_leaving
         self._record: SlotRecord | None = None  # of the present slot
-        self._before: list[Heard] = []  # heard after it began anew and before its first slot
+        self._before: list[ReceivedFrame] = []  # since it restarted, before its first slot
         self._no_priority = ""  # why it has none
         self._leaves_by: int | None = None  # CLOCK_MONOTONIC, ns
         self._signals = 0
 
     def _start(self) -> Station:
-        now = self.clock.local_ns(time.monotonic_ns())
-        sense = None if isinstance(self._vehicle, SimulatedVehicle) else lambda slot: self._vehicle.sense(self.swarm)
-        every_frame = self.watcher is not None or self._layout is not None
-        return Station(self.swarm, self._settings, now, sense, self, every_frame)
+        now, senses = self.clock.local_ns(time.monotonic_ns()), type(self._vehicle).sense is not AgentVehicle.sense
+        sense = (lambda slot: self._vehicle.sense(self.swarm)) if senses else None
+        return Station(
+            self.swarm, self._settings, now, sense, self, every_frame=bool(self.watcher or self._header is not None)
+        )
 
     # The loop.
 
     def run(self, stop: Stop) -> None:
-        """Fly until a signal comes or the time is over; with policy ``lease`` it first says that it leaves."""
+        """Fly until a signal comes or the time is over; with policy ``lease`` it first announces that it leaves."""
         wake_precisely()
         gc.collect()
         gc.freeze()  # nothing made so far is garbage: do not look at it again and again
-        with going_first(self.own.priority) as self._no_priority:
+        with realtime_thread(self.own.priority) as self._no_priority:
             self._run(stop)
-        self.tally.ended_ns = time.monotonic_ns()
+        self.counts.ended_ns = time.monotonic_ns()
 
     def _run(self, stop: Stop) -> None:
-        began = self.tally.began_ns = time.monotonic_ns()
+        began = self.counts.began_ns = time.monotonic_ns()
         end = began + round(self.own.duration_s * _SECOND) if self.own.duration_s else None
-        while not self._vehicle.ready():
+        while not self._vehicle.is_ready():
             now = time.monotonic_ns()
             self._reports.state("waits for the vehicle's odometry", now)
             if stop or (end is not None and now >= end):
@@ -141,12 +149,12 @@ class LiveAgent:
         self._close_record()
 
     def _has_ended(self, stop: Stop, end: int | None) -> bool:
-        """Whether to end now: after a second signal, when it has said that it leaves, or has no time left to."""
+        """Whether to end now: after a second signal, when it has announced that it leaves, or has no time left to."""
         now = time.monotonic_ns()
         if not stop and (end is None or now < end):
             return False
         if self._leaves_by is None:
-            if not self._says_leaving or self.slot < 0:
+            if not self.config.policy_row.says_leaving or self.slot < 0:
                 return True
             turns = (self.config.main_every + 1) * self.config.agents * self.config.slot_ns
             self._leaves_by, self._signals = now + min(_LEAVING_NS, turns), stop.count
@@ -155,18 +163,18 @@ class LiveAgent:
 
     def _fly(self, slot: int, now: int) -> None:
         """A slot has begun: fly through it."""
-        tally, hovers = self.tally, self.station.hovers
+        counts, hovers = self.counts, self.station.hovers
         self.slot = slot
         self._vehicle.fly(self.swarm, slot)
         if hovers == FLIES:
-            tally.flew = True
+            counts.flew = True
         elif hovers == NO_QUORUM:
-            tally.hovered[tally.flew] += 1
-        if now >= self._next_look_ns:
-            self._next_look_ns = now + _LOOK_NS
+            counts.hovered[counts.flew] += 1
+        if now >= self._status_due_ns:
+            self._status_due_ns = now + _STATUS_NS
             status = self.station.status
             if hovers != IS_NEW:
-                tally.look(status.others, status.hears)
+                counts.add_contacts(status.others, status.hears)
             self._reports.status(status, now)
 
     def _send(self, datagram: bytes, shown: int) -> None:
@@ -174,12 +182,11 @@ class LiveAgent:
         refusal = self.port.send(datagram)
         now = time.monotonic_ns()
         self.station.sent(self.clock.local_ns(now), not refusal)
+        self._reports.sent(refusal, now)
         if refusal:
-            self.tally.unsent[refusal] += 1
-            self._reports.refused(refusal, now)
+            self.counts.unsent[refusal] += 1
             return
-        self._reports.taken(now)
-        self.tally.sent(max(0, shown - self.station.slot_start_ns(self.station.slot)))
+        self.counts.add_sent(max(0, shown - self.station.slot_start_ns(self.station.slot)))
         if self._record is not None:
             self._record.sent_ns, self._record.datagram = shown, datagram
 
@@ -198,27 +205,27 @@ class LiveAgent:
         )  # fmt: skip
 
     def restarted(self, slot: int) -> None:
-        """The agent begins anew with the next slot."""
+        """The agent restarts with the next slot."""
         self._close_record()
         self._before.clear()
         self.slot = slot
-        self.tally.begun(slot + 1)
+        self.counts.add_start(slot + 1)
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         """Count and record a frame."""
-        if accepted and self._layout is not None:
-            start, late = self.station.slot_start_ns(slot), late_in(datagram, self._layout)
-            self.tally.off(arrival_ns - start - self._flight_ns - late)
+        if accepted and self._header is not None:
+            start, late = self.station.slot_start_ns(slot), lateness_ns(datagram, self._header)
+            self.counts.add_arrival(arrival_ns - start - self._flight_ns - late)
         if self.watcher is not None:
-            heard = Heard(sender, slot, arrival_ns, datagram, accepted)
-            (self._before if self._record is None else self._record.heard).append(heard)
+            frame = ReceivedFrame(sender, slot, arrival_ns, datagram, accepted)
+            (self._before if self._record is None else self._record.heard).append(frame)
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
         """Count and record a datagram that was not accepted."""
-        self.tally.refused[fault] += 1
+        self.counts.refused[fault] += 1
         self._reports.foreign(fault, time.monotonic_ns())
         if self.watcher is not None:
-            self.watcher.other(fault, datagram, arrival_ns)
+            self.watcher.refused(fault, datagram, arrival_ns)
 
     def _close_record(self) -> None:
         record, self._record = self._record, None
@@ -226,9 +233,9 @@ class LiveAgent:
             self.watcher.slot(record)
 
     def summary(self) -> dict[str, Any]:
-        """What came of it, as plain values."""
+        """Return the results of the flight, as plain values."""
         swarm, away = self.swarm, self.swarm.goal[:, 0] - self.swarm.position[:, 0]
-        refused = self.tally.refused + Counter({"malformed": swarm.malformed, "foreign": swarm.foreign})
+        refused = self.counts.refused + Counter({"malformed": swarm.malformed, "foreign": swarm.foreign})
         return {
             "id": self.own.id,
             "agents": self.config.agents,
@@ -237,7 +244,7 @@ class LiveAgent:
             "sealed": self.config.auth,
             "no_priority": self._no_priority,
             "quorum": self.own.quorum,
-            **self.tally.summary(self.station.status, self.station.longest_gap()),
+            **self.counts.summary(self.station.status, self.station.longest_gap()),
             "slots_too_short": self._reports.slots_too_short,
             "heard_of": sorted(int(k) + 1 for k in np.flatnonzero(swarm.sent_slot[0] >= 0) if k + 1 != self.own.id),
             "not_taken_in": dict(sorted(refused.items())),

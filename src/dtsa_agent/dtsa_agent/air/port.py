@@ -1,23 +1,46 @@
-"""What an agent with a clock of its own asks of a port. Times are integer ns, CLOCK_MONOTONIC."""
+"""What carries the datagrams of agents with clocks of their own: ports, their kinds by name, and the datagram itself.
+
+| bytes | what |
+|---|---|
+| 0-1 | ``DT`` |
+| 2 | version, 1 |
+| 3 | 0 |
+| 4-7 | of the settings that all agents share, and of the session: 32 bits of their hash, little-endian |
+| 8-9 | how much later than its sender's slot the frame left, in 10 us, little-endian; the tag covers it |
+| 10-25 | four agents that its sender hears: id, 0: none; how much later than expected, in 10 us |
+| 26-.. | the frame, signed or not |
+
+Datagrams of other swarms on the same group are rejected by their header. Where bytes are dear a port has a shorter one
+(:class:`PortProperties`): two to four bytes of the hash in place of the first eight, and fewer agents. Where there is
+no room at all, a signed frame is the datagram. A busy computer sends late; its clock is not late, and says by how much
+the frame is. Times are integer ns, CLOCK_MONOTONIC unless said otherwise.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any, NamedTuple, Protocol
 
-from dtsa_agent.core.station import Station
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.registry import POLICIES
+from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
+from dtsa_agent.core.station import BETWEEN, Link, Station
 
 _SECOND = 1_000_000_000
+_MAGIC = b"DT\x01\x00"
+_WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic
+_TRUST_NS = 1_000_000
+_UNIT_NS = 10_000  # of times in the header
 
 
 class ClockMap:
     """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift.
 
-    :param offset_ns: by how much it is ahead when it is made.
+    :param offset_ns: by how much it is ahead at ``began_ns``; None: now.
     :param drift_ppb: parts per billion by which it runs fast.
-    :param began_ns: when it is ahead by the offset, in place of now.
     """
 
     __slots__ = ("began_ns", "drift_ppb", "offset_ns")
@@ -37,11 +60,11 @@ class ClockMap:
 
 
 class Header(NamedTuple):
-    """What stands before a frame in a datagram, bytes, in this order; see :mod:`.datagram`."""
+    """Parts of a datagram before the frame, bytes, in this order."""
 
     agreed: int
     late: int  # 2, or 0: it does not say how late it left
-    peers: int  # four for each of them
+    peers: int  # four for each heard agent
 
     @property
     def size(self) -> int:
@@ -57,42 +80,37 @@ class PortProperties:
     flight_time_ns: int = 0  # from the order to send a datagram until its arrival, without the time of its bytes
     byte_time_ns: int = 0  # what each byte adds to that
     agreed_bytes: int = 8  # of a datagram's header, by which a swarm knows its own: 8, or 2 to 4 of them
-    peers: int = 4  # of those that an agent hears a datagram names so many
+    peers: int = 4  # heard agents that a datagram names
     longest: int = 512  # bytes of the longest datagram
-    bare_sealed: bool = False  # a sealed frame is the whole datagram: its tag tells the swarm from others
+    bare_sealed: bool = False  # a signed frame is the whole datagram: its tag tells the swarm from others
     shortest_slot_ns: int = 0  # shorter slots are refused
     turn_ns: int = 0  # of radios that take turns by themselves, how long one of them has its turn
     slots_hold_flights: bool = False  # slots in which a frame may arrive too late for the next one are refused
-    varies: bool = False  # frames arrive by milliseconds earlier or later than others: see `datagram.trust_ns`
+    varies: bool = False  # frames arrive by milliseconds earlier or later than others: see `trust_ns`
 
-    def header(self, sealed: bool) -> Header:
-        """What stands before a frame.
-
-        :param sealed: whether frames carry a tag.
-        """
-        if self.bare_sealed and sealed:
-            return Header(0, 0, 0)
-        return Header(self.agreed_bytes, 2, 4 * self.peers)
+    def header(self, signed: bool) -> Header:
+        """What stands before a frame, which carries a tag if it is signed."""
+        return Header(0, 0, 0) if self.bare_sealed and signed else Header(self.agreed_bytes, 2, 4 * self.peers)
 
 
 class ReceivedDatagram(NamedTuple):
-    """What has arrived."""
+    """A datagram that has arrived."""
 
     data: bytes
-    arrival_ns: int  # CLOCK_MONOTONIC
+    arrival_ns: int
     own: bool  # this very port has sent it
 
 
 class Listener(Protocol):
-    """What hears the datagrams of a swarm."""
+    """What hears the datagrams of a swarm. A context manager."""
 
-    say: Callable[[str], None] | None  # prints a line when the port fails or is back; its user sets it
+    log: Callable[[str], None] | None  # prints a line when the port fails or is back; its user sets it
 
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
 
     def receive(self, most: int) -> list[ReceivedDatagram]:
-        """Return what has arrived, so many datagrams at most, in this order; empty if nothing has."""
+        """Return what has arrived, at most so many datagrams, in this order; empty if nothing has."""
 
     def counts(self) -> dict[str, int]:
         """Return what it counts, by name, for the summary."""
@@ -108,10 +126,10 @@ class DatagramPort(Listener, Protocol):
     properties: PortProperties
 
     def send(self, data: bytes) -> str:
-        """Send a datagram at once; returns why the port has not taken it, or an empty text."""
+        """Send a datagram at once; return why the port has refused it, or an empty text."""
 
     def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
-        """Hand what has arrived, but for its own, to a station; returns how many datagrams have, so many at most."""
+        """Hand what others have sent to a station; return how many datagrams have arrived, at most so many."""
 
     def __enter__(self) -> DatagramPort: ...
 
@@ -129,3 +147,102 @@ class PortSettings(Protocol):
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain values."""
+
+
+#: Kinds of port by name, which `--air NAME` and the parameter ``air`` of a node choose from: module, port, settings.
+_PORTS = {
+    "udp": ("udp_port", "UdpPort", "UdpSettings"),
+    "crazyradio": ("crazyradio_port", "CrazyradioPort", "CrazyradioSettings"),
+    "serial": ("serial_port", "SerialPort", "SerialSettings"),
+}
+AIRS = tuple(_PORTS)
+
+
+def settings_class(air: str) -> Any:
+    """Return the settings class of a kind of port; its objects are :class:`PortSettings`.
+
+    :raises ConfigError: if there is none of this name.
+    """
+    if air not in _PORTS:
+        raise ConfigError("air", air, ", ".join(AIRS))
+    return getattr(import_module("dtsa_agent.air.settings"), _PORTS[air][2])
+
+
+def open_port(settings: PortSettings) -> DatagramPort:
+    """Return the port of an agent, or of a listener; only its module is imported.
+
+    :raises ConfigError: if it cannot be used.
+    """
+    module, cls, _ = _PORTS[settings.properties.name]
+    port: DatagramPort = getattr(import_module(f"dtsa_agent.air.{module}"), cls)(settings)
+    return port
+
+
+# The datagram.
+
+NETWORK = PortProperties("udp")  # with the longest header
+HEADER = NETWORK.header(signed=True).size  # bytes before the frame
+
+
+def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
+    """From the order to send a frame to its arrival, as agents take it to be, ns."""
+    length = port.header(config.auth).size + config.frame_length
+    return port.flight_time_ns + port.byte_time_ns * length + port.turn_ns * config.agents // 2  # half a round
+
+
+def lateness_ns(datagram: bytes, header: Header) -> int:
+    """How much later than its slot a datagram says to have left; 0 where it does not say."""
+    return int.from_bytes(datagram[header.agreed : header.agreed + header.late], "little") * _UNIT_NS
+
+
+def trust_ns(config: SwarmConfig, port: PortProperties) -> int:
+    """By how much a frame may be off its slot and still say what time it is."""
+    return config.slot_ns // 4 if port.varies else _TRUST_NS
+
+
+def shortest_slot_ns(config: SwarmConfig, port: PortProperties) -> int:
+    """The shortest slot that a port can carry: a frame that waits for a whole round is there in time."""
+    longest = flight_ns(config, port) + port.turn_ns * config.agents // 2
+    return max(port.shortest_slot_ns, round(longest / (1 - BETWEEN)) if port.slots_hold_flights else 0)
+
+
+def frame_in(datagram: bytes, config: SwarmConfig) -> bytes:
+    """The frame in a datagram of a swarm, with its tag if it is signed; empty for no datagram."""
+    return datagram[-config.frame_length :]
+
+
+def check_fits(config: SwarmConfig, port: PortProperties) -> None:
+    """Refuse frames that are too long for a port, and slots that are too short.
+
+    :raises ConfigError: if they are.
+    """
+    shortest_ns = shortest_slot_ns(config, port)
+    if config.slot_ns < shortest_ns:
+        allowed = f"at least {-(-shortest_ns // 100_000) / 10:g} over {port.name}"
+        if port.slots_hold_flights:
+            allowed += f" with frames of {config.frame_length} bytes"
+        if port.slots_hold_flights and config.extended:
+            plain = next(row.name for row in POLICIES.rows.values() if not row.extended)
+            short = replace(config, frame="paper", policy=plain if config.policy_row.extended else config.policy)
+            less_ms = -(-shortest_slot_ns(short, port) // 100_000) / 10
+            allowed += f", {less_ms:g} with {short.frame_length} (policy {short.policy}, frame paper)"
+        raise ConfigError("slot_ms", config.slot_ms, allowed)
+    room = port.longest - port.header(config.auth).size
+    if config.frame_length > room:
+        by = f"policy {config.policy}, frame {config.frame}{', sealed' if config.auth else ''}"
+        raise ConfigError("frame", f"{config.frame_length} bytes ({by})", f"at most {room} bytes over {port.name}")
+
+
+def header_of(config: SwarmConfig, port: PortProperties = NETWORK) -> bytes:
+    """Bytes with which all datagrams of a swarm begin."""
+    agreed = settings_hash(agreed_settings(config, port.name)).to_bytes(8, "little")
+    count = port.header(config.auth).agreed
+    return _MAGIC + agreed[:4] if count == _WITH_MAGIC else agreed[:count]
+
+
+def link_of(config: SwarmConfig, port: PortProperties = NETWORK) -> Link:
+    """What carries the datagrams of a swarm, for its stations."""
+    header = port.header(config.auth)
+    return Link(
+        header_of(config, port), header.late > 0, header.peers // 4, flight_ns(config, port), trust_ns(config, port)
+    )

@@ -1,4 +1,4 @@
-"""What a live agent prints in flight: a line when what it does changes, and one for each fault that lasts."""
+"""What a live agent prints in flight: a line when its state changes, and one for each fault that lasts."""
 
 from __future__ import annotations
 
@@ -21,24 +21,17 @@ _FOREIGN = {
 class Reports:
     """The lines of one agent. Times are CLOCK_MONOTONIC.
 
-    :param id: of the agent.
-    :param slot_ms: length of a slot.
-    :param say: prints a line; None: nothing is printed.
-    :param now_ns: the present.
-    :param show: shows a line in place of the one before, once a second; None: nobody looks.
+    :param log: prints a line; None: nothing is printed.
+    :param show: shows a line in place of the one before, once a second; None: nothing is shown.
     """
 
     def __init__(
-        self,
-        id: int,
-        slot_ms: float,
-        say: Callable[[str], None] | None,
-        now_ns: int,
+        self, id: int, slot_ms: float, log: Callable[[str], None] | None, now_ns: int,
         show: Callable[[str], None] | None = None,
-    ) -> None:
-        self._id, self._slot_ms, self._say, self._show = id, slot_ms, say, show
+    ) -> None:  # fmt: skip
+        self._id, self._slot_ms, self._log, self._show = id, slot_ms, log or (lambda line: None), show
         self._show_due_ns = now_ns
-        self._state = self._printed = ""  # what it does, and what was printed last
+        self._state = self._printed = ""  # the present state, and the one that was printed last
         self._state_due_ns = now_ns + _STATE_NS
         self._foreign: Counter[str] = Counter()
         self._foreign_due_ns = self._foreign_next_ns = 0
@@ -47,24 +40,17 @@ class Reports:
         self._timed = (-1, 0)  # frames of about the own time so far, of these off their slots
         self.slots_too_short = False
 
-    def _print(self, line: str) -> None:
-        if self._say is not None:
-            self._say(line)
-
     def state(self, text: str, now_ns: int) -> None:
-        """Report what the agent does, once it has lasted; what follows a colon may change without another line."""
-        kind = text.partition(":")[0]
-        if kind != self._state:
-            self._state, self._state_due_ns = kind, max(self._state_due_ns, now_ns + _STATE_NS)
-        if kind != self._printed and now_ns >= self._state_due_ns:
-            self._printed, self._state_due_ns = kind, now_ns + 2 * _STATE_NS
-            self._print(text)
+        """Report a state once it has lasted; what follows a colon may change without another line."""
+        state = text.partition(":")[0]
+        if state != self._state:
+            self._state, self._state_due_ns = state, max(self._state_due_ns, now_ns + _STATE_NS)
+        if state != self._printed and now_ns >= self._state_due_ns:
+            self._printed, self._state_due_ns = state, now_ns + 2 * _STATE_NS
+            self._log(text)
 
     def status(self, status: Any, now_ns: int) -> None:
-        """Report what a station's status says.
-
-        :param status: a ``dtsa_station_status`` with slots.
-        """
+        """Report the state in a ``dtsa_station_status`` with slots."""
         contact = f"hears {status.hears} of {status.others}, is heard by {status.heard_by} (quorum {status.needed})"
         texts = {
             FLIES: f"flies: {contact}", SAME_ID: f"hovers: another agent sends as {self._id}",
@@ -76,22 +62,22 @@ class Reports:
         if self._show is not None and now_ns >= self._show_due_ns:
             self._show_due_ns = now_ns + _SECOND
             self._show(f"slot {status.slot}, {status.sent} sent, {status.heard} heard; {text}")
-        self._check_lengths(status.timed, status.off)
+        self._check_slot_length(status.timed, status.off)
         if self._foreign_due_ns and now_ns >= self._foreign_due_ns:
             counts = "; ".join(f"{count} of {_FOREIGN[why]}" for why, count in sorted(self._foreign.items()))
-            self._print(f"datagrams not taken in so far: {counts}")
+            self._log(f"datagrams not taken in so far: {counts}")
             self._foreign_due_ns, self._foreign_next_ns = 0, now_ns + _FOREIGN_NS
 
-    def _check_lengths(self, timed: int, off: int) -> None:
-        """Look whether slots are too short: how many of the frames heard were off by more than a quarter of one."""
+    def _check_slot_length(self, timed: int, off: int) -> None:
+        """Report slots that are too short, by how many of the frames heard were off by more than a quarter of one."""
         before, off_before = max(self._timed[0], 0), self._timed[1]
         if timed - before < _TIMED_FRAMES:
             return
         share = (off - off_before) / (timed - before)
-        # The first ones may be of agents that are about to take over the time of this one.
+        # The first ones may be of agents that are about to adopt the time of this one.
         if self._timed[0] >= 0 and share > _OFF_SHARE and not self.slots_too_short:
             self.slots_too_short = True
-            self._print(
+            self._log(
                 f"slots of {self._slot_ms:g} ms are too short for this network: {share:.0%} of the last "
                 f"{timed - before} frames were off by more than a quarter of a slot"
             )
@@ -103,16 +89,18 @@ class Reports:
             self._foreign[fault] += 1
             self._foreign_due_ns = self._foreign_due_ns or max(now_ns + _SECOND, self._foreign_next_ns)
 
-    def refused(self, why: str, now_ns: int) -> None:
-        """Note a frame that the port has not taken; a queue that is full for a moment is worth no line."""
-        self._outage_ns, self._outage_count = self._outage_ns or now_ns, self._outage_count + 1
-        if not self._outage_printed and now_ns - self._outage_ns >= _SECOND:
-            self._outage_printed = True
-            self._print(f"no frame has left for {(now_ns - self._outage_ns) / 1e9:.1f} s: {why}")
-
-    def taken(self, now_ns: int) -> None:
-        """Note a frame that the port has taken."""
-        if self._outage_printed:
-            duration = (now_ns - self._outage_ns) / 1e9
-            self._print(f"frames leave again; for {duration:.1f} s none did, {self._outage_count} were refused")
-        self._outage_ns, self._outage_count, self._outage_printed = 0, 0, False
+    def sent(self, refusal: str, now_ns: int) -> None:
+        """Note a frame, and why the port has refused it; a queue that is full for a moment is worth no line."""
+        if refusal:
+            self._outage_ns, self._outage_count = self._outage_ns or now_ns, self._outage_count + 1
+        lasted_ns = now_ns - self._outage_ns
+        if refusal:
+            if not self._outage_printed and lasted_ns >= _SECOND:
+                self._outage_printed = True
+                self._log(f"no frame has left for {lasted_ns / 1e9:.1f} s: {refusal}")
+        elif self._outage_count:
+            if self._outage_printed:
+                self._log(
+                    f"frames leave again; for {lasted_ns / 1e9:.1f} s none did, {self._outage_count} were refused"
+                )
+            self._outage_ns, self._outage_count, self._outage_printed = 0, 0, False

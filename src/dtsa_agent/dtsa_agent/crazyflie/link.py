@@ -57,7 +57,7 @@ def require_cflib() -> None:
         import cflib.crtp
 
     if path := os.environ.get(SIMULATED_RADIO):
-        from dtsa_agent.air.crazyradio.simulated import replace_real_dongles
+        from dtsa_agent.air.crazyradio_simulated import replace_real_dongles
 
         replace_real_dongles(Path(path))
     if not cflib.crtp.CLASSES:

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.air.datagram import check_fits, header_of
-from dtsa_agent.air.port import PortProperties
+from dtsa_agent.air.port import PortProperties, check_fits, header_of
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Settings, check, setting

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
-from dtsa_agent.air.ports import AIRS
+from dtsa_agent.air.port import AIRS
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import MAX_AGENTS
 from dtsa_agent.core.settings.declaration import Setting
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import declare_setting, declare_swarm_namespace
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.node_process import ending, node_options, run_node
+from dtsa_agent.ros.common.parameters import declare_setting, declare_swarm_namespace
+from dtsa_agent.stop import Stop
 
 from .swarm_host import declare_swarm, host_agents
 

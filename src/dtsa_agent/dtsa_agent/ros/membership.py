@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from dtsa_msgs.msg import Process, Slot
@@ -15,29 +16,27 @@ from std_msgs.msg import Header
 
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from dtsa_agent.core.settings.config import settings_hash
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.runs import Call, run_text
-from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire import checks
-from dtsa_agent.ros.common.wire.checks import Intake, OnePublisher, Unusable
-from dtsa_agent.ros.common.wire.messages import Fields
+from dtsa_agent.ros.common import checks, names
+from dtsa_agent.ros.common.checks import BadMessage, Intake, PublisherGuard
+from dtsa_agent.ros.common.messages import Fields
+from dtsa_agent.ros.common.runs import Call, Patience, run_text
 
-_GONE_S = 6.0  # a channel that nobody has seen for so long will not come back; it announces itself every 3 s
-_TELL_S = 0.5  # counts are published that often at most
-_REFUSED_S = 10.0  # a process that has taken part for so long is not sent away any more
+_LOST_S = 6.0  # a channel that is not on the graph for so long will not come back; it announces itself every 3 s
+_COUNTS_S = 0.5  # counts are published that often at most
+_REFUSABLE_S = 10.0  # a process that has taken part for so long is not sent away any more
 _MOST_CALLERS = 16
 # A process that comes late shows itself on so many calls, one a second: it may find the channel before that finds it.
 _INTRODUCTIONS = 30
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last counts
 
 
+@dataclass(slots=True)
 class _Caller:
     """A channel that has called."""
 
-    def __init__(self, call: Call, sender: bytes | None) -> None:
-        self.call = call
-        self.publisher = OnePublisher(sender)
-        self.introductions = 0  # on calls of a run under way
+    call: Call
+    publisher: PublisherGuard
+    introductions: int = 0  # on calls of a run under way
 
 
 class Membership:
@@ -45,27 +44,21 @@ class Membership:
 
     :param ids: of the agents here.
     :param settings: as :func:`agreed_settings` gives them.
-    :param swarm_namespace: namespace of the swarm's topics.
     :param dropped_frames: returns the number of frames kept out so far, by reason.
-    :param check_next: raises :class:`Unusable` for a slot message that cannot be the next one, by its slot and time.
+    :param check_next: raises :class:`BadMessage` for a slot message that cannot be the next one.
     """
 
     def __init__(
-        self,
-        node: Node,
-        ids: Sequence[int],
-        settings: Mapping[str, Any],
-        swarm_namespace: str,
-        dropped_frames: Callable[[], dict[str, int]],
-        check_next: Callable[[Fields], None],
-    ) -> None:
+        self, node: Node, ids: Sequence[int], settings: Mapping[str, Any], swarm_namespace: str,
+        dropped_frames: Callable[[], dict[str, int]], check_next: Callable[[Fields], None],
+    ) -> None:  # fmt: skip
         self.run = 0  # the run's id; 0: none has begun yet
         self.intake = Intake(node.get_logger())
         self._agents, self._dropped_frames, self._check_next = int(settings["agents"]), dropped_frames, check_next
         self._callers: dict[int, _Caller] = {}  # by run
-        self._began_s = self._told_s = 0.0  # monotonic
+        self._began_s = self._counts_s = 0.0  # monotonic
         self._unseen = Patience()  # with a channel that is not on the graph
-        self._told: dict[str, int] = {}
+        self._counts: dict[str, int] = {}  # as published last
         self._following = 0  # another run that calls while this one lasts
         self._settings = json.dumps(settings, sort_keys=True, separators=(",", ":"))
         self._hash = settings_hash(settings)
@@ -81,7 +74,7 @@ class Membership:
         """
         try:
             self._check(message, sender)
-        except Unusable as error:
+        except BadMessage as error:
             self.intake.drop(error.reason, str(error))
             return False
         return True
@@ -94,42 +87,41 @@ class Membership:
             if phase == Slot.PREPARE:
                 self._following = run
                 self._publish_counts(left_over=True)
-            raise Unusable(checks.OTHER_RUN, f"slot message of run {run_text(run)}; this one is {run_text(self.run)}")
-        caller = self._callers.get(run)
-        if caller is None:
-            if not calls:
-                raise Unusable(checks.OTHER_RUN, f"slot message of run {run_text(run)}, which has not called here")
-            caller = self._meet(run, message.data, sender)
+            detail = f"slot message of run {run_text(run)}; this one is {run_text(self.run)}"
+            raise BadMessage(checks.OTHER_RUN, detail)
+        if run not in self._callers and not calls:
+            raise BadMessage(checks.OTHER_RUN, f"slot message of run {run_text(run)}, which has not called here")
+        caller = self._callers.get(run) or self._add_caller(run, message.data, sender)
         if phase == Slot.END:
             if not caller.call.ended_by(message.data):
-                raise Unusable(checks.FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
-            self._told_s = 0.0
+                raise BadMessage(checks.FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
+            self._counts_s = 0.0
             self._publish_counts()
             return
         self._check_next(message)
         if not caller.publisher.admits(time.monotonic(), sender):
-            raise Unusable(checks.OTHER_SENDER, f"a slot message of run {run_text(run)}, not of its channel")
+            raise BadMessage(checks.OTHER_SENDER, f"a slot message of run {run_text(run)}, not of its channel")
         if phase == Slot.REFUSE:
-            self._refused(message.data)
+            self._read_refusal(message.data)
         if phase == Slot.PREPARE or (calls and caller.introductions < _INTRODUCTIONS):
             caller.introductions = _INTRODUCTIONS if phase == Slot.PREPARE else caller.introductions + 1
             self._publish(run, self._settings)
 
-    def _meet(self, run: int, data: bytes, sender: bytes | None) -> _Caller:
+    def _add_caller(self, run: int, data: bytes, sender: bytes | None) -> _Caller:
         """A channel calls for the first time."""
         if not run:
-            raise Unusable(checks.OTHER_RUN, "a call without a run")
+            raise BadMessage(checks.OTHER_RUN, "a call without a run")
         try:
             call = Call.from_bytes(data)
         except ValueError as error:
-            raise Unusable(checks.RANGE, f"a call of nobody: {error}") from None
+            raise BadMessage(checks.RANGE, f"a call of nobody: {error}") from None
         while len(self._callers) >= _MOST_CALLERS:
             del self._callers[next(run for run in self._callers if run != self.run)]
-        caller = self._callers[run] = _Caller(call, sender)
+        caller = self._callers[run] = _Caller(call, PublisherGuard(sender))
         return caller
 
-    def is_heard(self) -> bool:
-        """Whether a channel receives what this process says about itself."""
+    def is_connected(self) -> bool:
+        """Whether a channel receives what this process publishes about itself."""
         return bool(self._publisher.get_subscription_count())
 
     def begin(self, run: int) -> None:
@@ -139,48 +131,41 @@ class Membership:
 
     @property
     def session(self) -> int:
-        """Session of authenticated frames in this run, as its channel says."""
+        """Session of authenticated frames in this run, as its channel has announced it."""
         return self._callers[self.run].call.session
 
-    def _refused(self, data: bytes) -> None:
+    def _read_refusal(self, data: bytes) -> None:
         """The channel sends a process away.
 
         :raises ConfigError: if it is this one.
         """
         if int.from_bytes(data[:8], "little") != self._process:
             return
-        if self.run and time.monotonic() - self._began_s > _REFUSED_S:
-            raise Unusable(checks.OTHER_SENDER, "this process takes part, and is told to go")
+        if self.run and time.monotonic() - self._began_s > _REFUSABLE_S:
+            raise BadMessage(checks.OTHER_SENDER, "this process takes part, and is told to go")
         try:
             reason = checks.parse_json(data[8:])
         except ValueError:
             reason = None
         if not isinstance(reason, list) or len(reason) != 3:
-            raise Unusable(checks.RANGE, "a refusal without a reason")
+            raise BadMessage(checks.RANGE, "a refusal without a reason")
         raise ConfigError(checks.plain(str(reason[0])), reason[1], checks.plain(str(reason[2])))
 
     def _publish_counts(self, left_over: bool = False) -> None:
         """Publish the counts of this run's messages, not too often."""
         now, counts = time.monotonic(), self.counts()
-        if now - self._told_s >= _TELL_S and (left_over or (self.run and counts != self._told)):
-            self._told, self._told_s = counts, now
+        if now - self._counts_s >= _COUNTS_S and (left_over or (self.run and counts != self._counts)):
+            self._counts, self._counts_s = counts, now
             self._publish(self.run)
 
     def _publish(self, run: int, settings: str = "") -> None:
         counts = self.counts()
         self._publisher.publish(
             Process(
-                header=Header(frame_id=names.FRAME),
-                run=run,
-                process=self._process,
-                node=self._node,
-                agent=self._ids,
-                settings_hash=self._hash,
-                settings=settings,
-                dropped_reason=list(counts),
-                dropped=list(counts.values()),
+                header=Header(frame_id=names.FRAME), run=run, process=self._process, node=self._node, agent=self._ids,
+                settings_hash=self._hash, settings=settings, dropped_reason=list(counts), dropped=list(counts.values()),
             )
-        )
+        )  # fmt: skip
 
     def counts(self) -> dict[str, int]:
         """Return the number of messages and frames not received so far, by reason."""
@@ -197,9 +182,9 @@ class Membership:
             return
         self._publish_counts()
         channel = self._callers[self.run].call.channel
-        if publishers or channel.paused:  # one that is stopped for long leaves the graph, too, and comes back
+        if publishers or channel.is_paused:  # one that is stopped for long leaves the graph, too, and comes back
             self._unseen = Patience()
-        if self._unseen.look() > _GONE_S or channel.gone:
+        if self._unseen.spent_s() > _LOST_S or channel.has_ended:
             following = f"; run {run_text(self._following)} calls now" if self._following else ""
             raise LocalProtocolError(f"the channel has gone after slot {slot} without ending the run{following}")
 

@@ -19,17 +19,17 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from dtsa_agent.air.driver import LiveAgent
-from dtsa_agent.air.ports import make_settings, open_port, settings_class
+from dtsa_agent.air.driver import AgentVehicle, LiveAgent
+from dtsa_agent.air.port import open_port, settings_class
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.declaration import Setting, Settings, setting, settings_of
 from dtsa_agent.core.swarm import Swarm
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings
-from dtsa_agent.ros.common.process.loop import HOUSEKEEPING_S, Feed
-from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, RANGE, Intake, OnePublisher, Unusable, check_odometry
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import OTHER_SENDER, RANGE, BadMessage, Intake, PublisherGuard, check_odometry
+from dtsa_agent.ros.common.loop import HOUSEKEEPING_S, Feed
+from dtsa_agent.ros.common.parameters import check_parameters, declare_setting, declare_settings
 from dtsa_agent.stop import Stop
 
 _DEFAULTS = {"policy": "lease", "auth": True}  # as of `tools/dtsa agent`
@@ -63,10 +63,9 @@ class VehicleSettings(Settings):
     command_topic: str = setting("cmd_vel", "topic on which the vehicle takes velocities")
     command_frame: str = setting(MAP, "axes of these velocities: the map's, or the body's", choices=(MAP, BODY))
     command_type: str = setting(
-        TWIST,
-        "geometry_msgs/TwistStamped, or dtsa_msgs/VelocityWorld as the bridge takes",
+        TWIST, "geometry_msgs/TwistStamped, or dtsa_msgs/VelocityWorld as the bridge takes",
         choices=(TWIST, VELOCITY_WORLD),
-    )
+    )  # fmt: skip
     command_hz: float = setting(50.0, "rate of the commands, at most one a slot", unit="Hz", minimum=1, maximum=200)
     stale_s: float = setting(0.3, "odometry older than this holds the vehicle", unit="s", minimum=0.02, maximum=5)
     fastest_mps: float = setting(
@@ -74,11 +73,11 @@ class VehicleSettings(Settings):
     )
 
 
-class OdometryVehicle:
-    """A vehicle that offers odometry and takes velocities; a :class:`~dtsa_agent.air.vehicle.Vehicle`.
+class OdometryVehicle(AgentVehicle):
+    """A vehicle that publishes odometry and follows velocities.
 
-    Odometry that cannot be, or lies where the vehicle cannot have got since the last one that was believed, is counted
-    and not used. Without any for a while the vehicle gets the velocity 0, and the agent says that it stands.
+    Odometry that cannot be, or lies where the vehicle cannot have got since the last accepted one, is counted and not
+    used. Without any for a while the vehicle gets the velocity 0, and its agent sends that it stands.
     """
 
     def __init__(self, node: Node, settings: VehicleSettings, slot_s: float) -> None:
@@ -86,13 +85,13 @@ class OdometryVehicle:
         self._every = max(1, round(1.0 / settings.command_hz / slot_s))
         self.intake = Intake(node.get_logger())
         self._origin = np.array(settings.odometry_origin)
-        self._last: tuple[float, Any, Any] | None = None  # s, monotonic; m, m/s, map: last believed
+        self._last: tuple[float, Any, Any] | None = None  # s, monotonic; m, m/s, map: last accepted
         self._attitude = (0.0, 0.0, 0.0, 1.0)  # of the same, x, y, z, w
         self._hold: Any = None  # m, map: where it was when it began to hover
         kind = TwistStamped if settings.command_type == TWIST else VelocityWorld
         self._publisher = node.create_publisher(kind, settings.command_topic, 1)
         self._feed = Feed(node, Odometry, settings.odometry_topic, _LATEST, intake=self.intake)
-        self._pilot = OnePublisher()  # of the odometry
+        self._guard = PublisherGuard()  # of the odometry
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._next_service_s = 0.0
@@ -112,13 +111,13 @@ class OdometryVehicle:
             self._feed.close()
             self._executor.shutdown(timeout_sec=0)
 
-    def ready(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether odometry has come, and is fresh."""
         self._update()
         return self._fresh() is not None
 
     @property
-    def never_seen(self) -> str:
+    def why_unknown(self) -> str:
         """Why it was never known where the vehicle is; empty: it was."""
         if self._last is not None:
             return ""
@@ -142,24 +141,24 @@ class OdometryVehicle:
     def _accept(self, message: Odometry) -> None:
         check_odometry(message)
         now, last = time.monotonic(), self._last
-        if not self._pilot.admits(now, self._feed.sender):
-            raise Unusable(OTHER_SENDER, "odometry from two publishers")
+        if not self._guard.admits(now, self._feed.sender):
+            raise BadMessage(OTHER_SENDER, "odometry from two publishers")
         place, speed, q = message.pose.pose.position, message.twist.twist.linear, message.pose.pose.orientation
         position = np.array((place.x, place.y, place.z)) + self._origin
         velocity, attitude = np.array((speed.x, speed.y, speed.z)), (q.x, q.y, q.z, q.w)
         if self._settings.twist_frame == BODY:
-            velocity = turned(attitude, velocity)
+            velocity = rotate(attitude, velocity)
         fastest = self._settings.fastest_mps
         if math.sqrt(float(velocity @ velocity)) > fastest:
-            raise Unusable(RANGE, f"odometry of more than {fastest:g} m/s")
+            raise BadMessage(RANGE, f"odometry of more than {fastest:g} m/s")
         if last is not None:
             away = position - last[1]
             if math.sqrt(float(away @ away)) > _SLACK_M + fastest * (now - last[0]):
-                raise Unusable(RANGE, "odometry that has jumped")
+                raise BadMessage(RANGE, "odometry that has jumped")
         self._last, self._attitude = (now, position, velocity), attitude
 
     def sense(self, swarm: Swarm) -> None:
-        """See Vehicle."""
+        """Write the newest odometry, moved on by its age, into the agent."""
         self._update()
         fresh = self._fresh()
         if fresh is None:
@@ -172,7 +171,7 @@ class OdometryVehicle:
         swarm.track[:, :, 0] = swarm.position[:, 0]
 
     def fly(self, swarm: Swarm, slot: int) -> None:
-        """See Vehicle."""
+        """Publish the velocity for a slot: the agent's command, or one that holds the vehicle."""
         if slot % self._every:
             return
         swarm.steer(slot, 0)
@@ -190,7 +189,7 @@ class OdometryVehicle:
         """Publish a velocity, (3,) m/s, map."""
         if self._settings.command_frame == BODY:
             x, y, z, w = self._attitude
-            velocity = turned((-x, -y, -z, w), velocity)
+            velocity = rotate((-x, -y, -z, w), velocity)
         if self._settings.command_type == TWIST:
             message = TwistStamped()
             message.header.frame_id = (
@@ -205,7 +204,7 @@ class OdometryVehicle:
         self._publisher.publish(message)
 
 
-def turned(q: tuple[float, float, float, float], v: Any) -> Any:
+def rotate(q: tuple[float, float, float, float], v: Any) -> Any:
     """Return a vector (3,) of the body in the map's axes; q: attitude x, y, z, w, body in map."""
     axis, w = np.array(q[:3]), q[3]
     across = 2.0 * np.cross(axis, v)
@@ -221,7 +220,7 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
     own = AgentSettings(id=agent, **declare_settings(node, AgentSettings, skip=("id",)))
     cls = settings_class(air)
     needed = {setting.name: "" for setting in settings_of(cls) if setting.required}  # an error if they are not given
-    chosen = make_settings(air, declare_settings(node, cls, defaults=needed))
+    chosen = cls.from_dict(declare_settings(node, cls, defaults=needed))
     settings = VehicleSettings.from_dict(declare_settings(node, VehicleSettings))
     vehicle = OdometryVehicle(node, settings, config.slot_s) if settings.vehicle == ODOMETRY else None
     out = str(declare_setting(node, _OUT))
@@ -230,7 +229,7 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
     logger = node.get_logger()
     try:
         with open_port(chosen) as port:
-            flying = LiveAgent(own, config, port, vehicle=vehicle, say=logger.warning)
+            flying = LiveAgent(own, config, port, vehicle=vehicle, log=logger.warning)
             with nullcontext() if record is None else record(out, flying, chosen) as recorder:
                 flying.run(stop)
             summary = flying.summary() if recorder is None else recorder.summary
@@ -238,8 +237,8 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
     finally:
         if vehicle is not None:
             vehicle.close()
-    if vehicle is not None and vehicle.never_seen:
-        raise DtsaError(f"no odometry that can be used: {vehicle.never_seen}")
+    if vehicle is not None and vehicle.why_unknown:
+        raise DtsaError(f"no odometry that can be used: {vehicle.why_unknown}")
     if recorder is not None and recorder.failure:
         raise DtsaError(recorder.failure)
     return 0

@@ -11,16 +11,16 @@ How a flight in real time works, and where each part stands ("channel": `dtsa_ch
 3. **On the air.** The channel (`realtime_channel`) puts each frame on the time line (`model/air`). Once no frame that
    overlaps it can come any more, its receivers are known, by reach, overlap and losses. A RUN message delivers it to
    all processes with the receivers' bits.
-4. **Received.** :meth:`~RealtimeNode._hear` hands it to the stations of those agents whose bit is set. The time of its
-   arrival shows which slot it is of, and moves their own slots.
+4. **Received.** :meth:`~RealtimeNode._receive` hands it to the stations of those agents whose bit is set. The time of
+   its arrival shows which slot it is of, and moves their own slots.
 5. **Reported.** Some ten times a second a process reports what its agents decided, received and flew (`reporter`). The
    channel fills an account for each slot (`answers`); it closes when all have reported or have been given up. The
    recorder, the metrics and the live view get closed accounts only: what agents had, not what they should have had.
 6. **Late.** No agent is waited for. One that is behind by too much restarts with the present slot, in probation. The
    channel itself (`realtime_channel.Pace`) ends a flight that cannot keep up, with the reason.
 7. **Coming and going.** A late agent listens, takes the time from the first frame that it hears, and hovers until the
-   others know it: all rules of the station. One that gets a signal says in its own turns that it leaves, and ends then
-   (:meth:`~RealtimeNode._ended`).
+   others know it: all rules of the station. One that gets a signal announces in its own turns that it leaves, and
+   ends then (:meth:`~RealtimeNode._ended`).
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ from dtsa_agent.core.station import (
     check_joinable,
 )
 from dtsa_agent.core.swarm import PRESENT_LEAVING
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.priority import take_priority
-from dtsa_agent.ros.common.wire.checks import SIZES, SLOT, Unusable, check_start
-from dtsa_agent.ros.common.wire.messages import Fields, header_of
-from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
+from dtsa_agent.priority import set_realtime
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import split_frames, unpack_received
+from dtsa_agent.ros.common.checks import SIZES, SLOT, BadMessage, check_start
+from dtsa_agent.ros.common.messages import Fields, header_of
+from dtsa_agent.stop import Stop
 
 from .reporter import Reporter
 from .swarm_node import AgentsNode
@@ -78,26 +78,20 @@ _MALFORMED = (LENGTH, NO_FRAME)  # of the reasons for which a station refuses fr
 
 
 class RealtimeAgent:
-    """A station, its clock, and a radio that sends when the slot begins what lies ready by then.
+    """A station, its clock, and a radio that sends when the slot begins what is ready by then.
 
-    All times but the station's own are ns on the channel's time line, from the start of slot 0.
+    All times but the station's own are ns on the channel's time line, from the start of slot 0; for the clock,
+    CLOCK_MONOTONIC stands for it.
 
-    :param clock: its clock; CLOCK_MONOTONIC stands for the channel's time line.
     :param jitter_ns: standard deviation of the time of a single transmission.
     :param accepted: called for each frame that the agent receives: sender, its slot, the slot here.
     :param refused: called with the reason for each that it refuses; empty: because of its content.
     """
 
     def __init__(
-        self,
-        id: int,
-        config: SwarmConfig,
-        scenario: Scenario,
-        clock: ClockMap,
-        jitter_ns: float,
-        accepted: Callable[[int, int, int], None],
-        refused: Callable[[str], None],
-    ) -> None:
+        self, id: int, config: SwarmConfig, scenario: Scenario, clock: ClockMap, jitter_ns: float,
+        accepted: Callable[[int, int, int], None], refused: Callable[[str], None],
+    ) -> None:  # fmt: skip
         self.id, self.clock = id, clock
         self.swarm = make_swarm(config, scenario, local=[id])
         self.slot = -1  # the present one
@@ -111,18 +105,13 @@ class RealtimeAgent:
         self._opened = False
 
     def begin(self, settings: StationSettings, zero: int) -> None:
-        """Take part from now on; ``zero``: CLOCK_MONOTONIC at the start of slot 0, ns."""
+        """Take part from now on; ``zero``: CLOCK_MONOTONIC at the start of slot 0."""
         self._zero = zero
         self.due_ns = self._now()
         self.station = Station(self.swarm, settings, self.clock.local_ns(self.due_ns), None, self)
 
     def _now(self) -> int:
         return time.monotonic_ns() - self._zero
-
-    @property
-    def leaves(self) -> bool:
-        """Whether it still has to say that it leaves."""
-        return bool(self.swarm.present[0] == PRESENT_LEAVING)
 
     def receive(self, frame: bytes, arrival_ns: int) -> None:
         """A frame has arrived."""
@@ -142,7 +131,7 @@ class RealtimeAgent:
         return self._opened
 
     def _send(self) -> None:
-        """Hand over the frame that lies ready: its transmission begins with the slot, but for jitter, or now."""
+        """Hand over the frame that is ready: its transmission begins with the slot, but for jitter, or now."""
         station, self.frame = self.station, b""
         self.slot = station.slot
         self._start_ns = station.slot_start_ns(self.slot)
@@ -166,7 +155,7 @@ class RealtimeAgent:
         self._opened = True
 
     def restarted(self, slot: int) -> None:
-        """It restarts: nothing to do here."""
+        """Nothing to do."""
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         """A frame was heard in its slot."""
@@ -183,16 +172,15 @@ class RealtimeAgent:
 class RealtimeNode(AgentsNode):
     """Agents that begin their slots by themselves.
 
-    As on a vehicle, where a timer sends what lies ready, decisions are made a little before a slot. A frame carries the
+    As on a vehicle, where a timer sends what is ready, decisions are made a little before a slot. A frame carries the
     time at which its agent starts to send it: its slot's start, or later if it was not ready by then. A process that
     comes after the channel's call is told where the time line lies, too, because the stamps of messages are on it.
 
     :param ids: of the agents that live here, ascending.
-    :param authenticator: holds the key, if the settings say that frames are authenticated.
     :param clocks: one an agent, on the channel's time line; none: without offset and drift.
-    :param jitter_ns: ns, standard deviation of the time of a single transmission.
+    :param jitter_ns: standard deviation of the time of a single transmission.
     :param align: whether agents move their slots towards what they hear.
-    :param flight_time_ns: ns from the order to send a frame until the receivers' flight processors have it.
+    :param flight_time_ns: from the order to send a frame until the receivers' flight processors have it.
     :param priority: real-time priority of the process, where allowed, once all have found each other; 0: none.
     :param resume_at: m, x, y, z of each agent in turn: where its vehicle hovers when it comes into a flight under way;
         none: at its start in the scenario.
@@ -201,20 +189,10 @@ class RealtimeNode(AgentsNode):
     mode = "realtime"
 
     def __init__(
-        self,
-        node: Node,
-        config: SwarmConfig,
-        ids: Sequence[int],
-        swarm_namespace: str = names.SWARM,
-        *,
-        authenticator: Authenticator | None = None,
-        clocks: Sequence[ClockMap] = (),
-        jitter_ns: float = 0.0,
-        align: bool = True,
-        flight_time_ns: int = 0,
-        priority: int = 0,
-        resume_at: Sequence[float] = (),
-    ) -> None:
+        self, node: Node, config: SwarmConfig, ids: Sequence[int], swarm_namespace: str = names.SWARM, *,
+        authenticator: Authenticator | None = None, clocks: Sequence[ClockMap] = (), jitter_ns: float = 0.0,
+        align: bool = True, flight_time_ns: int = 0, priority: int = 0, resume_at: Sequence[float] = (),
+    ) -> None:  # fmt: skip
         self.slot_ns, self._flight_ns = config.slot_ns, flight_time_ns
         self._authenticator, self._align = authenticator, align
         scenario = make_scenario(config)
@@ -246,29 +224,29 @@ class RealtimeNode(AgentsNode):
         now = time.monotonic_ns()
         if message.phase == Slot.START:
             if not 0 < message.time_ns <= now + _LONGEST_LEAD_NS:
-                raise Unusable(SLOT, f"a start at {message.time_ns / 1e9:.3f} s, which cannot be")
+                raise BadMessage(SLOT, f"a start at {message.time_ns / 1e9:.3f} s, which cannot be")
         elif message.phase == Slot.RUN and self._zero:
             if not len(message.sender):
-                raise Unusable(SIZES, "a delivery without a frame")
+                raise BadMessage(SIZES, "a delivery without a frame")
             here = max(self.slot, (now - self._zero) // self.slot_ns)
             check_start(message.heard_slot * self.slot_ns, here * self.slot_ns)
             check_start(message.time_ns - names.TIME_ZERO_NS - self._flight_ns, now - self._zero)
 
     def _dropped_frames(self) -> dict[str, int]:
-        malformed = max(agent.swarm.malformed for agent in self.agents)
-        foreign = max(agent.swarm.foreign for agent in self.agents)
-        for fault, count in self._dropped.items():
-            malformed += count * (fault in _MALFORMED)
-            foreign += count * (fault not in (*_MALFORMED, REJECTED))
+        malformed = sum(self._dropped[fault] for fault in _MALFORMED)
         rejected = self._dropped[REJECTED]
+        foreign = self._dropped.total() - malformed - rejected
         return {
-            "frame malformed": malformed, "frame foreign": foreign, "frame rejected": rejected, REFUSED: self._refused,
-        }  # fmt: skip
+            "frame malformed": malformed + max(agent.swarm.malformed for agent in self.agents),
+            "frame foreign": foreign + max(agent.swarm.foreign for agent in self.agents),
+            "frame rejected": rejected,
+            REFUSED: self._refused,
+        }
 
     # From the call to the end.
 
     def run(self, stop: Stop) -> None:
-        """Fly until the run is over or a signal comes; with policy ``lease`` agents first say that they leave.
+        """Fly until the run is over or a signal comes; with policy ``lease`` agents first announce that they leave.
 
         :raises ConfigError: in a flight under way that agents of this policy cannot come into.
         """
@@ -295,7 +273,7 @@ class RealtimeNode(AgentsNode):
                 if agent.slot >= 0:
                     agent.station.leave()
         in_time = stop.count == self._signals and self.slot <= self._leaves_by
-        if in_time and any(agent.leaves for agent in self.agents):
+        if in_time and any(agent.swarm.present[0] == PRESENT_LEAVING for agent in self.agents):
             return not self.loop.subscription.get_publisher_count()
         self._reporter.publish(self.membership.run, self.slot)
         for publisher in (self._air, self._telemetry):
@@ -322,7 +300,7 @@ class RealtimeNode(AgentsNode):
         By turns of 0.1 s, as real-time priority has them, that would take minutes.
         """
         if self._priority:
-            take_priority(self._priority)
+            set_realtime(self._priority)
             self._priority = 0
 
     def _may_join(self) -> bool:
@@ -331,7 +309,7 @@ class RealtimeNode(AgentsNode):
         :raises ConfigError: with a policy whose tables all have to be equal.
         """
         check_joinable(self.config.policy)
-        return self.membership.is_heard() and bool(
+        return self.membership.is_connected() and bool(
             self._air.get_subscription_count() and self._telemetry.get_subscription_count()
         )
 
@@ -361,14 +339,13 @@ class RealtimeNode(AgentsNode):
             message = self.loop.wait(min(remaining, _PATIENCE_NS))
             if message is None:
                 return True
-            goes_on = self._take(message)
+            goes_on = self._receive(message)
             os.sched_yield()  # all agents of this machine hear a frame before any of them goes on
             return goes_on
-        for _ in range(_BURST):
-            message = self.loop.take()
+        for message in (self.loop.take() for _ in range(_BURST)):
             if message is None:
                 break
-            if not self._take(message):
+            if not self._receive(message):
                 return False
         self._sense()
         opened = []
@@ -383,13 +360,10 @@ class RealtimeNode(AgentsNode):
             self._fly_on(opened)
         return True
 
-    def _take(self, message: Fields) -> bool:
-        if message.phase == Slot.RUN:
-            self._hear(message)
-        return message.phase != Slot.END
-
-    def _hear(self, message: Fields) -> None:
-        """Hand frames to the agents that receive them."""
+    def _receive(self, message: Fields) -> bool:
+        """Hand frames to the agents that receive them; return False when the run is over."""
+        if message.phase != Slot.RUN:
+            return bool(message.phase != Slot.END)
         self._heard_ns = time.monotonic_ns() - self._zero
         arrival = message.time_ns - names.TIME_ZERO_NS
         received = unpack_received(message.received, len(message.sender), self.config.agents)
@@ -398,9 +372,10 @@ class RealtimeNode(AgentsNode):
             for index in np.flatnonzero(mask[self._columns]).tolist():
                 self.agents[index].receive(frame, arrival)
             self._dropped.update(self._faults)
+        return True
 
     def _accepted(self, index: int, sender: int, slot: int, here: int) -> None:
-        self._reporter.add_heard(index, sender, slot, here, self._heard_ns)
+        self._reporter.add_received(index, sender, slot, here, self._heard_ns)
 
     def _refuse(self, fault: str) -> None:
         if fault == REPEATED:  # it has it
@@ -430,11 +405,11 @@ class RealtimeNode(AgentsNode):
         for index in opened:
             self._fly(index)
         complete = min(agent.slot for agent in self.agents if agent.slot >= 0)
-        if self._reporter.due(complete):
+        if self._reporter.is_due(complete):
             self._reporter.publish(self.membership.run, complete)
 
     def _sense(self) -> None:
-        """Note where vehicles are that fly elsewhere."""
+        """Write the state of vehicles that fly elsewhere."""
 
     def _fly(self, index: int) -> None:
         """Fly the vehicle of an agent through its slot."""

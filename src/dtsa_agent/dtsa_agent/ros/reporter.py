@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.messages import REPORT
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.messages import REPORT
 
 _PERIOD_NS = 100_000_000
-_MOST_HEARD = 1000  # received frames that wait to be reported: far more than a swarm sends in one period
+_MOST_RECEIVED = 1000  # frames that wait to be reported: far more than a swarm sends in one period
 
 # Fields of a swarm, as they are, and before them the start of a slot or transmission and the length of the frame.
 _FIELDS = {"chosen": "<u2", "reason": "u1", "digest": "<u4", "score": "<f8", "track": "<f8", "velocity": "<f8",
            "command": "<f8", "goal": "<f8"}  # fmt: skip
 _KINDS = {"offset_ns": "<i8", "length": "u1", **_FIELDS}
+_RECEIVED_KINDS = {"heard_sender": "H", "heard_slot": "I", "heard_in": "I", "heard_ns": "q"}
 
 
 class Reporter:
@@ -36,7 +37,7 @@ class Reporter:
         self._phase = ids[0] % self._every  # processes report in different slots
         self._last = -1  # slot reported last
         self._rows: dict[int, dict[int, tuple[bytes, ...]]] = {}  # by slot and agent
-        self._heard: dict[tuple[int, int, int, int], int] = {}  # by sender, slot, slot here, ns: bits of the agents
+        self._received: dict[tuple[int, int, int, int], int] = {}  # by sender, slot, slot here, ns: bits of the agents
 
     def add_slot(self, index: int, slot: int, offset_ns: int, length: int, swarm: Swarm) -> None:
         """Note what an agent, alone in its swarm, has decided for a slot, and where it is; before it flies on.
@@ -48,24 +49,24 @@ class Reporter:
         own = offset_ns.to_bytes(8, "little", signed=True), bytes((length,))
         self._rows.setdefault(slot, {})[index] = own + tuple(getattr(swarm, name).tobytes() for name in _FIELDS)
 
-    def add_heard(self, index: int, sender: int, slot: int, here: int, at_ns: int) -> None:
+    def add_received(self, index: int, sender: int, slot: int, here: int, at_ns: int) -> None:
         """Note a frame that an agent has received: the slot that its sender counted, the slot here, channel time."""
-        if len(self._heard) < _MOST_HEARD:
+        if len(self._received) < _MOST_RECEIVED:
             key = sender, slot, max(0, here), at_ns
-            self._heard[key] = self._heard.get(key, 0) | 1 << index
+            self._received[key] = self._received.get(key, 0) | 1 << index
 
-    def due(self, slot: int) -> bool:
+    def is_due(self, slot: int) -> bool:
         """Whether it is time for a report, when all agents here have begun a slot."""
         return slot > self._last and (slot - self._last >= self._every or slot % self._every == self._phase)
 
     def publish(self, run_id: int, slot: int) -> None:
         """Publish all that has been collected up to a slot."""
         self._last = slot if slot < names.FIRST_CALL else -1
-        everybody = tuple(range(len(self._ids)))
-        ready = sorted(slot_there for slot_there in self._rows if slot_there <= slot)
+        all_agents = tuple(range(len(self._ids)))
+        ready = sorted(row for row in self._rows if row <= slot)
         groups = [(agents, list(slots)) for agents, slots in groupby(ready, key=lambda s: tuple(sorted(self._rows[s])))]
-        if self._heard and everybody not in [agents for agents, _ in groups]:
-            groups.append((everybody, []))
+        if self._received and all_agents not in [agents for agents, _ in groups]:
+            groups.append((all_agents, []))
         for agents, slots in groups:
             rows = [self._rows[row][index] for row in slots for index in agents]
             columns = zip(*rows, strict=True) if rows else ((),) * len(_KINDS)
@@ -73,7 +74,7 @@ class Reporter:
             fields = {
                 name: np.frombuffer(b"".join(column), kind).reshape(shape).transpose(0, 2, 1).tobytes() if rows else b""
                 for (name, kind), column in zip(_KINDS.items(), columns, strict=True)
-            } | self._heard_fields(agents == everybody)
+            } | self._pack_received(agents == all_agents)
             last = slots[-1] if slots and slots[-1] < names.FIRST_CALL else 0
             self._publisher.publish(
                 REPORT.pack_fields(
@@ -88,14 +89,12 @@ class Reporter:
         for row in ready:
             del self._rows[row]
 
-    def _heard_fields(self, of_all: bool) -> dict[str, bytes]:
+    def _pack_received(self, of_all: bool) -> dict[str, bytes]:
         """Return the frames received since the last report; none in a report of some agents alone."""
-        heard, width = self._heard if of_all else {}, -(-len(self._ids) // 8)
+        received, width = self._received if of_all else {}, -(-len(self._ids) // 8)
         if of_all:
-            self._heard = {}
-        columns = zip(*heard, strict=True) if heard else ((),) * 4
-        kinds = {"heard_sender": "H", "heard_slot": "I", "heard_in": "I", "heard_ns": "q"}
-        fields = {
-            name: array(kind, column).tobytes() for (name, kind), column in zip(kinds.items(), columns, strict=True)
-        }
-        return {**fields, "heard_by": b"".join(bits.to_bytes(width, "little") for bits in heard.values())}
+            self._received = {}
+        columns = list(zip(*received, strict=True)) or [()] * 4
+        kinds = zip(_RECEIVED_KINDS.items(), columns, strict=True)
+        fields = {name: array(kind, column).tobytes() for (name, kind), column in kinds}
+        return {**fields, "heard_by": b"".join(bits.to_bytes(width, "little") for bits in received.values())}

@@ -17,17 +17,17 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
 from dtsa_agent.core.settings.declaration import Setting, Settings, setting
 from dtsa_agent.keys import authenticator, with_key
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import (
+from dtsa_agent.priority import PrioritySettings, set_nice
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.node_process import ending, node_options, run_node
+from dtsa_agent.ros.common.parameters import (
     check_parameters,
     declare_list,
     declare_setting,
     declare_settings,
     swarm_wide_node,
 )
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
-from dtsa_agent.ros.common.process.priority import PrioritySettings, give_way_by
+from dtsa_agent.stop import Stop
 
 from .swarm_node import AgentsNode, SwarmNode
 
@@ -44,10 +44,9 @@ class HostSettings(Settings):
 
     odometry: bool = setting(True, "offer each agent's true motion as <agent>/odom")
     mode: str = setting(
-        names.MODES[0],
-        "in lockstep all wait for each other; in real time each agent has a clock of its own",
+        names.MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own",
         choices=names.MODES,
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +58,9 @@ class RealtimeSettings(Settings):
     )
     align: bool = setting(True, "agents move their slots towards what they hear")
     nice: int = setting(
-        0,
-        "without real-time priority: by how much this process gives way to others, the channel above all: nice",
-        minimum=0,
-        maximum=19,
-    )
+        0, "without real-time priority: by how much this process gives way to others, the channel above all: nice",
+        minimum=0, maximum=19,
+    )  # fmt: skip
 
 
 def declare_swarm(node: Node) -> SwarmConfig:
@@ -87,14 +84,9 @@ def declare_ids(node: Node, agents: int) -> list[int]:
 
 
 def host_agents(
-    node: Node,
-    ids: Sequence[int],
-    config: SwarmConfig,
-    stop: Stop,
-    space: str = names.SWARM,
-    shared: bool = False,
+    node: Node, ids: Sequence[int], config: SwarmConfig, stop: Stop, space: str = names.SWARM, shared: bool = False,
     spaces: Sequence[str] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Declare the rest of the parameters and run agents until the end.
 
     :param ids: of the agents that live here, ascending.
@@ -110,7 +102,7 @@ def host_agents(
     if host.mode == names.MODES[0]:
         agents: AgentsNode = SwarmNode(node, with_key(make_swarm(config, local=ids, shared_table=shared)), space)
     else:
-        agents = _realtime(node, config, ids, space, priority)
+        agents = _realtime_node(node, config, ids, space, priority)
     if host.odometry:
         agents.offer_odometry(spaces)
     logger = node.get_logger()
@@ -126,10 +118,10 @@ def host_agents(
         agents.loop.close()
 
 
-def _realtime(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, priority: int) -> AgentsNode:
+def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, priority: int) -> AgentsNode:
     from .realtime import ClockMap, RealtimeNode
 
-    def whole_numbers(name: str, count: int, text: str) -> list[int]:
+    def declare_numbers(name: str, count: int, text: str) -> list[int]:
         values = declare_list(node, name, [0], text)
         if len(values) not in (1, count):
             raise ConfigError(name, values, f"{count} whole numbers, or one for all")
@@ -137,30 +129,22 @@ def _realtime(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, p
 
     count = len(ids)
     text = "offset of each agent's clock at the start, one for all or one an agent; positive: early (ns)"
-    offset = whole_numbers("clock_offset_ns", count, text)
-    drift = whole_numbers("clock_drift_ppb", count, "by how much each agent's clock runs fast (parts per billion)")
+    offset = declare_numbers("clock_offset_ns", count, text)
+    drift = declare_numbers("clock_drift_ppb", count, "by how much each agent's clock runs fast (parts per billion)")
     own = RealtimeSettings(**declare_settings(node, RealtimeSettings))
     text = "from the order to send until a receiver has the frame: for any frame, and more for each of its bytes (ns)"
-    fixed, per_byte = whole_numbers("flight_time_ns", 2, text)
+    fixed, per_byte = declare_numbers("flight_time_ns", 2, text)
     text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
     places = declare_list(node, "resume_at", [0.0], text)
     if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):
         raise ConfigError("resume_at", places, f"{3 * count} numbers with a decimal point: x, y, z of each agent")
     if own.nice:
-        give_way_by(own.nice)
+        set_nice(own.nice)
     return RealtimeNode(
-        node,
-        config,
-        ids,
-        space,
-        authenticator=authenticator(config),
-        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)],
-        jitter_ns=own.clock_jitter_ns,
-        align=own.align,
-        flight_time_ns=fixed + per_byte * config.frame_length,
-        priority=priority,
-        resume_at=places if len(places) > 1 else (),
-    )
+        node, config, ids, space, authenticator=authenticator(config), jitter_ns=own.clock_jitter_ns, align=own.align,
+        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)], priority=priority,
+        flight_time_ns=fixed + per_byte * config.frame_length, resume_at=places if len(places) > 1 else (),
+    )  # fmt: skip
 
 
 def _body(stop: Stop, supervised: bool) -> None:

@@ -19,18 +19,19 @@ from dtsa_agent.core import AgentGroup, Swarm
 from dtsa_agent.core.agent import REFUSED
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.loop import HOUSEKEEPING_S, Loop, Stop
-from dtsa_agent.ros.common.process.waiting import Waiting
-from dtsa_agent.ros.common.wire.checks import SLOT as SLOT_REASON
-from dtsa_agent.ros.common.wire.checks import Unusable
-from dtsa_agent.ros.common.wire.messages import SLOT, TRANSMISSION, Fields, time_of
-from dtsa_agent.ros.common.wire.packing import POSE_COVARIANCE, TWIST_COVARIANCE, split_frames, unpack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import POSE_COVARIANCE, TWIST_COVARIANCE, split_frames, unpack_received
+from dtsa_agent.ros.common.checks import SLOT as SLOT_REASON
+from dtsa_agent.ros.common.checks import BadMessage
+from dtsa_agent.ros.common.loop import HOUSEKEEPING_S, Loop
+from dtsa_agent.ros.common.messages import SLOT, TRANSMISSION, Fields, time_of
+from dtsa_agent.ros.common.runs import WaitingLog
+from dtsa_agent.stop import Stop
 
 from .membership import Membership
 
 _SERVE_S = 0.001  # an executor reads messages so often
-_STRANGERS = 32  # messages that may wait beside the channel's
+_OTHER_MESSAGES = 32  # that may wait beside the channel's: they must not push those out before they are read
 _ODOMETRY_DEPTH = 10  # messages for a slow reader; reliable, because RViz asks for that
 
 
@@ -47,17 +48,15 @@ class AgentsNode(ABC):
         self.node, self.config, self.ids = node, config, tuple(ids)
         self.slot = -1  # the last slot that has begun here
         self._odometry: list[tuple[int, Publisher, str]] = []  # place among those here, frame of the body
-        self._watched: list[tuple[int, Publisher, str]] = []
+        self._watched: list[tuple[int, Publisher, str]] = []  # those of them with subscribers
         self._namespace = swarm_namespace
-        self._waiting = Waiting(node.get_logger())
-        self._begun = False
+        self._waiting = WaitingLog(node.get_logger())
+        self._has_begun = False
         self._make_publishers(swarm_namespace, names.lockstep_qos(waiting))
         settings = agreed_settings(config, self.mode)
         self.membership = Membership(node, ids, settings, swarm_namespace, self._dropped_frames, self._check_next)
-        # Messages of strangers must not push the channel's out before they are read.
-        qos = names.lockstep_qos(max(waiting, _STRANGERS // 4))
+        qos, topic = names.lockstep_qos(max(waiting, _OTHER_MESSAGES // 4)), f"{swarm_namespace}/{names.SLOT}"
         intake, admits = self.membership.intake, self.membership.admits
-        topic = f"{swarm_namespace}/{names.SLOT}"
         self.loop = Loop(node, Slot, topic, qos, intake=intake, admits=admits, read=SLOT.read_fields)
 
     @abstractmethod
@@ -73,10 +72,10 @@ class AgentsNode(ABC):
 
     @abstractmethod
     def _check_next(self, message: Fields) -> None:
-        """Raise Unusable for a slot message that cannot be the next one."""
+        """Raise BadMessage for a slot message that cannot be the next one."""
 
     def offer_odometry(self, namespaces: Sequence[str] | None = None) -> None:
-        """Offer each agent's true motion as ``odom``; published only while somebody subscribes.
+        """Offer each agent's true motion as ``odom``; published only while a node subscribes.
 
         :param namespaces: one an agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
         """
@@ -96,17 +95,16 @@ class AgentsNode(ABC):
         self.membership.idle(publishers, self.slot)
         if self.slot < 0:
             channel = "the channel is there" if publishers else f"a channel on {subscription.topic_name}"
-            self._waiting.tell(f"waiting for {'slot 0: ' if publishers else ''}{channel}")
-        elif not self._begun:
-            self._begun = True
+            self._waiting.log(f"waiting for {'slot 0: ' if publishers else ''}{channel}")
+        elif not self._has_begun:
+            self._has_begun = True
             self.node.get_logger().info(f"slot 0 has begun: run {self.membership.run:08x}")
         self._watched = [entry for entry in self._odometry if entry[1].get_subscription_count()]
 
     def _publish_odometry(self, entry: tuple[int, Publisher, str], swarm: Swarm, column: int, slot: int) -> None:
         """Publish the position of an agent, in a column of a swarm, at the start of a slot."""
         message = Odometry()
-        message.pose.covariance = POSE_COVARIANCE
-        message.twist.covariance = TWIST_COVARIANCE
+        message.pose.covariance, message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
         message.header.frame_id = names.FRAME
         message.header.stamp = time_of(names.slot_time_ns(slot, self.config.slot_ns))
         # The attitude is not modelled, it is the identity: the body's axes are those of the map.
@@ -143,18 +141,13 @@ class SwarmNode(AgentsNode):
         return self.agents.swarm
 
     def _dropped_frames(self) -> dict[str, int]:
-        swarm = self.agents.swarm
-        return {
-            "frame malformed": swarm.malformed,
-            "frame foreign": swarm.foreign,
-            "frame rejected": swarm.rejected,
-            REFUSED: self.agents.refused,
-        }
+        counts = {f"frame {name}": getattr(self.swarm, name) for name in ("malformed", "foreign", "rejected")}
+        return {**counts, REFUSED: self.agents.refused}
 
     def _check_next(self, message: Fields) -> None:
         # The channel waits for this node's answer: it can be nowhere else.
         if message.phase == Slot.RUN and not 0 <= message.slot - self.slot <= 1:
-            raise Unusable(SLOT_REASON, f"slot {message.slot} after slot {self.slot}")
+            raise BadMessage(SLOT_REASON, f"slot {message.slot} after slot {self.slot}")
 
     def run(self, stop: Stop) -> None:
         """Answer slot messages until the run is over or a signal comes."""
@@ -199,7 +192,7 @@ class SwarmNode(AgentsNode):
             if self.config.auth and not self.config.auth_session:
                 self.swarm.begin_session(self.membership.session)
         else:
-            self._hear(message, slot - 1)
+            self._receive_frames(message, slot - 1)
             self.agents.on_slot_end()
         self._answer(slot, self.agents.on_slot(slot))
         self.slot = slot
@@ -208,39 +201,27 @@ class SwarmNode(AgentsNode):
         self.swarm.fly(slot)
         return True
 
-    def _hear(self, message: Fields, slot: int) -> None:
+    def _receive_frames(self, message: Fields, slot: int) -> None:
         """Hand the agents the frames that the air carried in a slot."""
         count = len(message.sender)
         if not count:
             self.agents.on_frames(slot, (), (), self._no_frames)
             return
-        heard = unpack_received(message.received, count, self.config.agents)
-        self.agents.on_frames(slot, message.sender, split_frames(message.data, message.length), heard)
+        received = unpack_received(message.received, count, self.config.agents)
+        self.agents.on_frames(slot, message.sender, split_frames(message.data, message.length), received)
 
     def _answer(self, slot: int, senders: Sequence[int]) -> None:
-        swarm = self.swarm
-        lengths = bytearray(len(swarm.ids))
+        swarm, lengths = self.swarm, bytearray(len(self.ids))
         frames = [swarm.frame(index) for index in senders]
         for index, frame in zip(senders, frames, strict=True):
             lengths[index] = len(frame)
         goal = swarm.goal.tobytes()
         self._bytes = TRANSMISSION.pack_fields(
-            names.slot_time_ns(slot, self.config.slot_ns),
-            run=self.membership.run,
-            slot=slot,
-            agent=self._agent_ids,
-            length=bytes(lengths),
-            data=b"".join(frames),
-            offset_ns=b"",
-            chosen=swarm.chosen.tobytes(),
-            reason=swarm.reason.tobytes(),
-            digest=swarm.digest.tobytes(),
-            score=swarm.score.tobytes(),
-            steps=self.config.steps,
-            track=swarm.track.tobytes(),
-            velocity=swarm.velocity.tobytes(),
-            command=swarm.command.tobytes(),
-            goal=goal if goal != self._goal else b"",  # sent when it changes
-        )
+            names.slot_time_ns(slot, self.config.slot_ns), run=self.membership.run, slot=slot, agent=self._agent_ids,
+            length=bytes(lengths), data=b"".join(frames), offset_ns=b"", chosen=swarm.chosen.tobytes(),
+            reason=swarm.reason.tobytes(), digest=swarm.digest.tobytes(), score=swarm.score.tobytes(),
+            steps=self.config.steps, track=swarm.track.tobytes(), velocity=swarm.velocity.tobytes(),
+            command=swarm.command.tobytes(), goal=goal if goal != self._goal else b"",  # sent when it changes
+        )  # fmt: skip
         self._goal = goal
         self._publisher.publish(self._bytes)

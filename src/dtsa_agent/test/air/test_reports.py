@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_agent.air.datagram import link_of
+from dtsa_agent.air.port import link_of
 from dtsa_agent.air.reports import Reports
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig

@@ -20,9 +20,9 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Process, Slot
 from nav_msgs.msg import Odometry
 
-from dtsa_agent.ros.common.process.runs import Call, ProcessName, Run
-from dtsa_agent.ros.common.wire import checks
-from dtsa_agent.ros.common.wire.checks import RANGE, SIZES, SLOT, UNKNOWN, Intake, OnePublisher, Unusable, check_slot
+from dtsa_agent.ros.common import checks
+from dtsa_agent.ros.common.checks import RANGE, SIZES, SLOT, UNKNOWN, BadMessage, Intake, PublisherGuard, check_slot
+from dtsa_agent.ros.common.runs import Call, ProcessName, Run
 
 HEARD = {"sender": [2, 12], "length": [2, 1], "data": [1, 2, 3], "received": [1, 2, 3, 4]}
 
@@ -30,7 +30,7 @@ HEARD = {"sender": [2, 12], "length": [2, 1], "data": [1, 2, 3], "received": [1,
 def reason(check: Any, *arguments: Any) -> str:
     try:
         check(*arguments)
-    except Unusable as error:
+    except BadMessage as error:
         return error.reason
     return ""
 
@@ -71,7 +71,7 @@ def test_transmissions_start_about_now(start_ns: int, now_ns: int) -> None:
 
 
 def test_one_publisher_is_admitted_until_it_is_silent() -> None:
-    known, first = OnePublisher(b"one"), OnePublisher()
+    known, first = PublisherGuard(b"one"), PublisherGuard()
     for publisher in (known, first):
         assert publisher.admits(1.0, b"one")
         assert not publisher.admits(1.1, b"two")
@@ -87,9 +87,9 @@ def test_only_the_channel_can_end_its_run() -> None:
     assert call.ended_by(run.proof)
     assert not call.ended_by(Run.draw().proof)
     assert not call.ended_by(b"")
-    assert not call.channel.gone
-    assert not ProcessName(call.channel.node, "elsewhere", 1, 1).gone
-    assert ProcessName(call.channel.node, call.channel.machine, call.channel.pid, call.channel.started + 1).gone
+    assert not call.channel.has_ended
+    assert not ProcessName(call.channel.node, "elsewhere", 1, 1).has_ended
+    assert ProcessName(call.channel.node, call.channel.machine, call.channel.pid, call.channel.started + 1).has_ended
 
 
 def test_a_stopped_process_is_paused_and_not_gone() -> None:
@@ -97,17 +97,17 @@ def test_a_stopped_process_is_paused_and_not_gone() -> None:
         fields = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").split()
         name = ProcessName("/swarm/channel", ProcessName.own("").machine, process.pid, int(fields[21]))
         try:
-            assert not name.paused
-            assert not name.gone
+            assert not name.is_paused
+            assert not name.has_ended
             process.send_signal(signal.SIGSTOP)
-            wait_for(lambda: name.paused)
-            assert not name.gone
-            assert not ProcessName(name.node, name.machine, name.pid, name.started + 1).paused
+            wait_for(lambda: name.is_paused)
+            assert not name.has_ended
+            assert not ProcessName(name.node, name.machine, name.pid, name.started + 1).is_paused
         finally:
             process.kill()
-        wait_for(lambda: name.gone)
-        assert not name.paused
-    assert not ProcessName(name.node, "elsewhere", name.pid, name.started).paused
+        wait_for(lambda: name.has_ended)
+        assert not name.is_paused
+    assert not ProcessName(name.node, "elsewhere", name.pid, name.started).is_paused
 
 
 @given(

@@ -44,7 +44,7 @@ int late(void) {
 """
 PROGRAM = """
 import ctypes, errno, sys
-from dtsa_agent.ros.common.workarounds._endless import mend
+from dtsa_agent.ros.common._endless import mend
 library = ctypes.CDLL(sys.argv[1])
 assert mend("no such library") == 0
 if sys.argv[2] == "mended":
@@ -74,8 +74,8 @@ def test_the_middlewares_waits_are_mended_where_it_needs_that() -> None:
     """That of the wheels calls us once ROS has been initialized; that of apt never asks for such a wait."""
     pytest.importorskip("rclpy")
     program = (
-        "from pathlib import Path\nfrom dtsa_agent.ros.common.process.node_process import init_ros\n"
-        "from dtsa_agent.ros.common.workarounds._endless import mend\ninit_ros([])\n"
+        "from pathlib import Path\nfrom dtsa_agent.ros.common.node_process import init_ros\n"
+        "from dtsa_agent.ros.common._endless import mend\ninit_ros([])\n"
         "maps = Path('/proc/self/maps').read_text()\n"
         "assert 'libfastrtps' not in maps or mend('libfastrtps') == 1\n"
     )

@@ -14,7 +14,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Report, Slot, Transmission
 from rclpy.serialization import deserialize_message, serialize_message
 
-from dtsa_agent.ros.common.wire.messages import REPORT, SLOT, TRANSMISSION, Fields, MessageType, header_of, read_report
+from dtsa_agent.ros.common.messages import REPORT, SLOT, TRANSMISSION, Fields, MessageType, header_of, read_report
 
 MOST, STEPS = 12, 2
 words, stamps = st.integers(0, 2**32 - 1), st.integers(-(2**60), 2**60)

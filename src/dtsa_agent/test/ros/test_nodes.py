@@ -24,10 +24,10 @@ from std_msgs.msg import Header
 
 from dtsa_agent.core import REASONS, SwarmConfig, decode_frame, make_scenario
 from dtsa_agent.core.frame import decode_extended
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.runs import Run
-from dtsa_agent.ros.common.wire.messages import time_of
-from dtsa_agent.ros.common.wire.packing import split_frames
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import split_frames
+from dtsa_agent.ros.common.messages import time_of
+from dtsa_agent.ros.common.runs import Run
 
 AGENT, HOST = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host"
 

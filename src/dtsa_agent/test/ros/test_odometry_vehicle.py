@@ -19,7 +19,7 @@ from nav_msgs.msg import Odometry
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, turned
+from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, rotate
 
 AGENT = "dtsa_agent.ros.agent_node"
 STEP_S = 0.02
@@ -70,8 +70,8 @@ class Vehicle:
 
 
 def test_axes_of_the_body_are_turned_into_those_of_the_map() -> None:
-    assert turned(ATTITUDE, np.array((1.0, 0.0, 0.0))) == pytest.approx((0.0, 1.0, 0.0))
-    assert turned(ATTITUDE, np.array((0.0, 1.0, 3.0))) == pytest.approx((-1.0, 0.0, 3.0))
+    assert rotate(ATTITUDE, np.array((1.0, 0.0, 0.0))) == pytest.approx((0.0, 1.0, 0.0))
+    assert rotate(ATTITUDE, np.array((0.0, 1.0, 3.0))) == pytest.approx((-1.0, 0.0, 3.0))
 
 
 @pytest.mark.ros

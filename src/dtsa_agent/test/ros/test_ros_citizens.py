@@ -25,10 +25,10 @@ from rclpy.task import Future
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from dtsa_agent.core.settings.declaration import settings_of
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import check_parameters
-from dtsa_agent.ros.common.process.node_process import log_where_possible
-from dtsa_agent.ros.common.process.waiting import Waiting
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.node_process import log_where_possible
+from dtsa_agent.ros.common.parameters import check_parameters
+from dtsa_agent.ros.common.runs import WaitingLog
 from dtsa_agent.ros.swarm_node import SwarmNode
 
 AGENT, HOST, CHANNEL = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host", "dtsa_channel_sim.ros.channel_node"
@@ -43,11 +43,11 @@ def graph(tmp_path: Path) -> Iterator[Graph]:
 def test_waiting_is_said_at_once_and_then_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
     logger, now = MagicMock(), 100.0
     monkeypatch.setattr("time.monotonic", lambda: now)
-    waiting, times = Waiting(logger), []
+    waiting, times = WaitingLog(logger), []
     for tenth in range(6000):
         now = 100.0 + 0.1 * tenth
         before = len(logger.mock_calls)
-        waiting.tell("waiting for cf3")
+        waiting.log("waiting for cf3")
         if len(logger.mock_calls) > before:
             times.append(round(now - 100.0))
     assert logger.mock_calls[0] == call.info("waiting for cf3")
@@ -56,7 +56,7 @@ def test_waiting_is_said_at_once_and_then_ever_more_seldom(monkeypatch: pytest.M
     assert gaps == sorted(gaps)
     assert gaps[0] < 10
     assert max(gaps) <= 61
-    waiting.tell("waiting for cf4")
+    waiting.log("waiting for cf4")
     assert logger.mock_calls[-1] == call.info("waiting for cf4")
 
 

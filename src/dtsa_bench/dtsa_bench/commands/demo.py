@@ -83,7 +83,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
     from dtsa_bench.flights.domain import clear_hindrances
 
     clear_hindrances(os.environ)
-    from dtsa_agent.ros.common.process.loop import Stop
+    from dtsa_agent.stop import Stop
     from dtsa_bench.pages.demo.flights import HEAD, demo_steps, fly_all, table_rows
     from dtsa_bench.pages.report.page import write_report
 

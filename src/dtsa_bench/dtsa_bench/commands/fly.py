@@ -89,9 +89,9 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
         from dtsa_bench.flights.domain import clear_hindrances
 
         clear_hindrances(os.environ)
-        from dtsa_agent.ros.common.process.loop import Stop
-        from dtsa_bench.flights.agents import process_count
+        from dtsa_agent.stop import Stop
         from dtsa_bench.flights.flight import fly
+        from dtsa_bench.flights.options import process_count
 
         options = FlightOptions(
             processes=process_count(args.processes, config.swarm.agents),
@@ -197,7 +197,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     use_simulated_radio(args)
     path = Path(args.config)
     settings = load_swarm(path)
-    from dtsa_agent.ros.common.process.loop import Stop
+    from dtsa_agent.stop import Stop
     from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
     from dtsa_bench.crazyflies.missions.places import mission_defaults
 

@@ -8,9 +8,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from dtsa_agent.air.datagram import check_fits
-from dtsa_agent.air.port import PortSettings
-from dtsa_agent.air.ports import AIRS, settings_class
+from dtsa_agent.air.port import AIRS, PortSettings, check_fits, settings_class
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError

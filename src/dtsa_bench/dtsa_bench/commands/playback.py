@@ -51,8 +51,7 @@ Other nodes follow it with use_sim_time:=true. Keys: space pauses and goes on, q
         import rclpy
 
         from dtsa_agent.core.errors import ConfigError
-        from dtsa_agent.ros.common.process.node_process import init_ros
-        from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+        from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
         from dtsa_bench.log.bag.reader import Bag
         from dtsa_bench.log.bag.replay import Player, RosOutput
 
@@ -141,7 +140,7 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.usage = "%(prog)s [OPTIONS]"
         parser.add_argument("bags", nargs="*", help=argparse.SUPPRESS)
-        from dtsa_agent.air.ports import AIRS
+        from dtsa_agent.air.port import AIRS
 
         parser.add_argument("--air", choices=(_ROS, *AIRS), help="what carries the swarm's frames [ros]")
         parser.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the swarm")
@@ -186,7 +185,7 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
             history = RunHistory(settings.where)
             source = NetworkListener(history, config, settings)
         else:
-            from dtsa_agent.ros.common.graph import names
+            from dtsa_agent.ros.common import names
             from dtsa_bench.pages.view.graph import GraphSource
 
             domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common.process.node_process import SUPERVISOR
+from dtsa_agent.ros.common.node_process import SUPERVISOR
 
 # A process group of its own; Python 3.10 cannot say so without a function that runs in the child.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
@@ -51,7 +51,7 @@ class Children:
         self._logs = logs
         self._environment = {**os.environ, **environment, SUPERVISOR: str(os.getpid())}
         self.all: list[Child] = []
-        self._told: list[Child] = []
+        self._reported: list[Child] = []  # that have ended
 
     def start(self, name: str, agents: Sequence[int], module: str, arguments: Sequence[str]) -> None:
         """Starts a module with arguments, as `python -m` does.
@@ -72,16 +72,16 @@ class Children:
             )
         self.all.append(Child(name, agents, process, log, module, arguments))
 
-    def again(self, child: Child, more: Sequence[str] = ()) -> None:
-        """Starts a process that has ended another time; the new one takes its place."""
+    def restart(self, child: Child, more: Sequence[str] = ()) -> None:
+        """Start a process that has ended another time; the new one takes its place."""
         self.all.remove(child)
         self.start(child.name, child.agents, child.module, [*child.arguments, *more])
         self.all[-1].arguments = child.arguments
 
     def ended(self) -> list[Child]:
         """Processes that have ended since this was asked last."""
-        fresh = [child for child in self.all if child.process.poll() is not None and child not in self._told]
-        self._told += fresh
+        fresh = [child for child in self.all if child.process.poll() is not None and child not in self._reported]
+        self._reported += fresh
         return fresh
 
     def check(self) -> None:
@@ -116,5 +116,5 @@ def describe_end(child: Child) -> str:
     if code < 0:
         return f"{who} was killed by {signal.Signals(-code).name}"
     lines = child.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    said = f": {lines[-1]}" if lines else ""
-    return f"{who} ended with code {code}{said}"
+    last = f": {lines[-1]}" if lines else ""
+    return f"{who} ended with code {code}{last}"

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.ros.common.workarounds.dds import RANGE
+from dtsa_agent.ros.common.node_process import RANGE
 
 # Ports of RTPS: 7400 + 250 domain + 10 + 2 participant (+ 1). Beyond domain 101 they meet Linux's ephemeral ports.
 LAST_FREE_DOMAIN = 101

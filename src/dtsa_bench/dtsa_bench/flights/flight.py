@@ -39,14 +39,12 @@ from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.station import check_joinable, check_slotted
 from dtsa_agent.keys import check_key
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.graph.parameters import to_parameters
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.process.priority import give_way_by, take_place, take_priority
-from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
-from dtsa_agent.stop import StopToken
+from dtsa_agent.priority import set_nice, set_realtime, set_realtime_or_nice
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.names import agent_names
+from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
+from dtsa_agent.ros.common.parameters import to_parameters
+from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.metrics import may_share
 from dtsa_bench.runs.options import new_directory
@@ -55,10 +53,9 @@ from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .agents import CHANNEL_NICE, agent_processes
 from .children import Children
 from .domain import ros_domain
-from .options import FlightOptions
+from .options import CHANNEL_NICE, FlightOptions, agent_processes
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import LateStart, RealtimeSupervisor, Supervisor
@@ -133,16 +130,10 @@ def _check_policy(run: RunConfig, options: FlightOptions) -> None:
 
 
 def fly(
-    run: RunConfig,
-    out: str | Path,
-    options: FlightOptions | None = None,
-    stop: Stop | None = None,
-    label: str = "fly",
-    started: Callable[[Children], None] | None = None,
-    observers: Sequence[ChannelObserver] = (),
-    progress: ProgressLine | None = None,
-    on_domain: Callable[[int, Mapping[str, str]], None] | None = None,
-) -> Flight:
+    run: RunConfig, out: str | Path, options: FlightOptions | None = None, stop: Stop | None = None,
+    label: str = "fly", started: Callable[[Children], None] | None = None, observers: Sequence[ChannelObserver] = (),
+    progress: ProgressLine | None = None, on_domain: Callable[[int, Mapping[str, str]], None] | None = None,
+) -> Flight:  # fmt: skip
     """Carries out one flight; when this returns or raises, no process of it is left and its bag is closed.
 
     :param out: directory for the bag and the results; empty, or not there yet.
@@ -185,23 +176,16 @@ def fly(
 
 
 def _fly(
-    flight: RecordedFlight,
-    node: Node,
-    directory: Path,
-    children: Children,
-    progress: ProgressLine,
-    options: FlightOptions,
-    stop: Stop,
-    late: Sequence[LateStart],
-    observers: Sequence[ChannelObserver],
-) -> Flight:
+    flight: RecordedFlight, node: Node, directory: Path, children: Children, progress: ProgressLine,
+    options: FlightOptions, stop: Stop, late: Sequence[LateStart], observers: Sequence[ChannelObserver],
+) -> Flight:  # fmt: skip
     failure: DtsaError | None = None
     try:
         channel, measurement = flight.channel, flight.measurement
         shown = FlightProgress(progress, measurement, channel)
         supervisor: Supervisor | RealtimeSupervisor = Supervisor(children)
         if isinstance(channel, RealtimeChannel):
-            supervisor = RealtimeSupervisor(children, channel, measurement, progress.say, options.respawn, late)
+            supervisor = RealtimeSupervisor(children, channel, measurement, progress.print_line, options.respawn, late)
             supervisor.follow_parameters(node)
         channel.observe(supervisor, shown, *observers)
         limit_s = options.wall_limit_s(flight.run_config.limits.timeout_s)
@@ -231,7 +215,9 @@ def _fly(
 def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: FlightProgress, priority: int) -> None:
     """The flight itself; the channel is closed afterwards."""
     # Before its agents, and both before all else if that is allowed.
-    first = isinstance(channel, RealtimeChannel) and not take_place(priority and priority + 1, CHANNEL_NICE, False)
+    first = isinstance(channel, RealtimeChannel) and not set_realtime_or_nice(
+        priority and priority + 1, CHANNEL_NICE, False
+    )
     try:
         channel.run(ended)
         shown.show()
@@ -242,8 +228,8 @@ def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: Fl
             channel.close()
         finally:
             if first and not ended.stop:  # who has been told to end does so before all else
-                take_priority(0)
-                give_way_by(0)
+                set_realtime(0)
+                set_nice(0)
 
 
 def _cut_short(channel: Any, ended: StopToken, failure: DtsaError | None) -> dict[str, str]:
@@ -270,7 +256,7 @@ def _start_agents(
             raise KeyboardInterrupt
         own, name, module = dict(process.parameters), f"cf{process.ids[0]}", "dtsa_agent.ros.agent_node"
         if process.executable == "swarm_host":
-            name, module = f"{process.node} with {named(process.ids)}", "dtsa_agent.ros.swarm_host"
+            name, module = f"{process.node} with {agent_names(process.ids)}", "dtsa_agent.ros.swarm_host"
             own["shared_table"] = run.mode == LOCKSTEP and may_share(run)
         words = [*common, "-r", f"__ns:={process.namespace}", "-r", f"__node:={process.node}"]
         words += [word for key, value in own.items() for word in ("-p", f"{key}:={json.dumps(value)}")]

@@ -45,7 +45,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         """Wall-clock time of the flight so far, s."""
         return max(0.0, (self.end_s or time.monotonic()) - self.begin_s) if self.begin_s else 0.0
 
-    def begun(self, at_s: float) -> None:
+    def start_known(self, at_s: float) -> None:
         self.begin_s = at_s
 
     def all_answered(self, slot: int, answers: Answers) -> None:
@@ -66,15 +66,15 @@ class FlightMeasurement(ChannelObserver, Referee):
     def reason(self) -> str:
         return str(self.metrics.end or "")
 
-    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         self._outcome = verdict.outcome
         self._compared = answers.digest.copy(), answers.chosen.copy()
         self._lengths = [len(frames[sender]) for sender in verdict.senders]
         self.scenario.advance(slot, self._tables)  # what all know about each other's goals
         mask = verdict.mask(self._agents)
         self.hearing.slot(len(verdict.senders), mask)
-        if answers.taken_in is not None:  # in real time the receivers themselves know best
-            for taken in answers.taken_in:
+        if answers.receipts is not None:  # in real time the receivers themselves know best
+            for taken in answers.receipts:
                 self._hear(taken.slot, taken.data, taken.mask)
         else:
             for row, sender in enumerate(verdict.senders):

@@ -42,7 +42,7 @@ class ProgressLine:
             self._stream.write(f"{self._label}: {text}\n")
         self._stream.flush()
 
-    def say(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         """Prints a line that stays."""
         self._stream.write(f"\r\x1b[K{self._label}: {text}\n" if self._terminal else f"{self._label}: {text}\n")
         self._stream.flush()

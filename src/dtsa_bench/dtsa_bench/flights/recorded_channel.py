@@ -16,12 +16,12 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.config import agreed_settings
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 from dtsa_agent.keys import check_key
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings, swarm_wide_node
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import ending, run_node
-from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
-from dtsa_agent.ros.common.process.runs import Run
+from dtsa_agent.priority import PrioritySettings, set_realtime
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.node_process import ending, run_node
+from dtsa_agent.ros.common.parameters import check_parameters, declare_setting, declare_settings, swarm_wide_node
+from dtsa_agent.ros.common.runs import Run
+from dtsa_agent.stop import Stop
 from dtsa_bench.drawing import optional_picture
 from dtsa_bench.runs.config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.options import new_directory
@@ -48,15 +48,9 @@ class RecordedFlight:
     """
 
     def __init__(
-        self,
-        node: Node,
-        run: RunConfig,
-        directory: Path,
-        startup_s: float,
-        answer_s: float,
-        end_s: float = 4.0,
+        self, node: Node, run: RunConfig, directory: Path, startup_s: float, answer_s: float, end_s: float = 4.0,
         space: str = names.SWARM,
-    ) -> None:
+    ) -> None:  # fmt: skip
         identity = Run.draw(run.swarm.auth_session)
         agreed = agreed_settings(run.swarm, run.mode)
         if run.swarm.auth:  # the bag says in which session its frames are authentic
@@ -88,7 +82,7 @@ class RecordedFlight:
     def summary(self) -> dict[str, Any]:
         """The flight's results."""
         channel = self.channel
-        result = {**self.measurement.summary(), "unusable_messages": channel.unusable}
+        result = {**self.measurement.summary(), "unusable_messages": channel.intake.total}
         result["not_taken_in"] = kept_out = dict(sorted(channel.dropped().items()))
         hearing = self.measurement.hearing
         hearing.settle(kept_out)
@@ -155,7 +149,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s, space=space)
         try:
             if run.mode != LOCKSTEP:
-                take_priority(first)
+                set_realtime(first)
             flight.channel.run(stop)
         finally:
             flight.channel.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,9 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import Scenario
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
-from dtsa_agent.ros.common.wire.messages import Fields
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import REPRESENTATION, SECOND, pack_received
+from dtsa_agent.ros.common.messages import Fields
 from dtsa_bench.log.arrays import PRESENT, UNRECORDED
 from dtsa_bench.log.bag.cdr import CdrBuilder, OdometryPacker
 from dtsa_bench.log.bag.metadata import RUN_ID
@@ -26,7 +26,7 @@ from dtsa_bench.log.record import FORMAT, FORMAT_KEY, SLOT_RECORD, TYPE, frame_f
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import Change
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
-from dtsa_channel_sim.ros.answers import Answers
+from dtsa_channel_sim.ros.answers import Answers, received_in
 from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.run_topics import RunState, configuration_message
 
@@ -34,8 +34,7 @@ from .slot_messages import SlotMessages
 
 _VIEW_NS = 50_000_000  # simulated time from one picture of the swarm to the next
 _WAIT_NS = 10_000_000_000  # for reports of agents that are not lost: a channel that stood still gets them late
-_DECIDED = {"chosen": np.uint16, "reason": np.uint8, "digest": np.uint32, "score": np.float64}
-_VECTORS = ("velocity", "command", "goal")
+_REPORTED = ("chosen", "reason", "digest", "score", "offset_ns", "track", "velocity", "command", "goal")
 
 
 class FlightRecorder(ChannelObserver):
@@ -69,8 +68,8 @@ class FlightRecorder(ChannelObserver):
         self._complete = -1  # last slot that all have answered,
         self._answered, self._track = np.zeros(agents, np.bool_), np.zeros((self._steps, 3, agents))  # and who, where
         self._state = RunState(run_id, self._slot_ns)
-        told = bytes(serialize_message(configuration_message(run.to_dict(), run_id)))
-        self.bag.write(settings, told, names.TIME_ZERO_NS, names.TIME_ZERO_NS)
+        data = bytes(serialize_message(configuration_message(run.to_dict(), run_id)))
+        self.bag.write(settings, data, names.TIME_ZERO_NS, names.TIME_ZERO_NS)
 
     def _time_ns(self, slot: int) -> int:
         """Simulated time at which a slot starts, ns."""
@@ -138,10 +137,12 @@ class FlightRecorder(ChannelObserver):
         if self._accounts is None:
             self._pending.append((self._record, self._packed.record(slot, answers, verdict), at))
         else:
-            self._accounts.judge(verdict)
+            self._accounts.resolve(verdict)
         if slot % self._view_slots == 0:
             motion = self._packer.pack(at, answers.position, answers.velocity)
-            self._pending += [(channel, data, at) for channel, data in zip(self._odometry, motion, strict=True)]
+            # Where an agent is that has not reported is not known: its report may come later, into the record alone.
+            reported = zip(self._odometry, motion, answers.answered, strict=True)
+            self._pending += [(channel, data, at) for channel, data, is_known in reported if is_known]
             self._pending.append((self._markers, self._packed.markers(slot, answers, verdict), at))
 
     def settings_changed(self, change: Change) -> None:
@@ -164,25 +165,23 @@ class FlightRecorder(ChannelObserver):
         self.bag.close()
 
 
-class _Account:
+@dataclass
+class _SentFrame:
+    """A frame in real time, and what became of it."""
+
+    data: bytes
+    start_ns: int
+    verdict: tuple[NDArray[np.bool_], int, int] | None = None  # (N,) received, lost, collided
+
+
+class _Account(Answers):
     """What is known of one slot in real time."""
 
     def __init__(self, agents: int, steps: int) -> None:
-        self.known, self.sent = np.zeros(agents, np.bool_), np.zeros(agents, np.bool_)  # who has reported, and sent
-        kinds = _DECIDED | {"offset_ns": np.int64}
-        self.decided = {name: np.zeros(agents, kind) for name, kind in kinds.items()}
-        self.track = np.zeros((steps, 3, agents))
-        self.vectors = {name: np.zeros((3, agents)) for name in _VECTORS}
-        self.frames: dict[int, _Frame] = {}  # by sender
-        self.heard: list[tuple[int, int, int, NDArray[np.bool_]]] = []  # sender, its slot, ns, (N,) by whom
-
-
-class _Frame:
-    """A frame in real time, and what became of it."""
-
-    def __init__(self, data: bytes, start_ns: int) -> None:
-        self.data, self.start_ns = data, start_ns
-        self.verdict: tuple[NDArray[np.bool_], int, int] | None = None  # (N,) received, lost, collided
+        super().__init__(agents, steps)
+        self.sent = np.zeros(agents, np.bool_)  # agents that have sent a frame
+        self.sent_frames: dict[int, _SentFrame] = {}  # by sender
+        self.heard: list[tuple[int, int, int, NDArray[np.bool_]]] = []  # sender, its slot, ns, (N,) receivers
 
 
 class RealtimeAccounts:
@@ -193,7 +192,7 @@ class RealtimeAccounts:
         self._wait = max(2, _WAIT_NS // slot_ns)
         self._open: dict[int, _Account] = {}
         self._next = 0  # first slot that is not written
-        self._unjudged: dict[int, deque[_Frame]] = {}  # by sender
+        self._unresolved: dict[int, deque[_SentFrame]] = {}  # by sender
         self.lost: set[int] = set()  # ids of agents that nothing is waited for from
 
     def _account(self, slot: int) -> _Account | None:
@@ -206,45 +205,35 @@ class RealtimeAccounts:
 
     def add_frame(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
         """A frame goes on the air."""
-        frame = _Frame(data, start_ns)
-        self._unjudged.setdefault(sender, deque()).append(frame)
+        frame = _SentFrame(data, start_ns)
+        self._unresolved.setdefault(sender, deque()).append(frame)
         account = self._account(slot)
         if account is not None:
-            account.frames.setdefault(sender, frame)
+            account.sent_frames.setdefault(sender, frame)
 
-    def judge(self, verdict: Verdict) -> None:
-        """The channel has judged frames, those of each sender in the order in which they were sent."""
+    def resolve(self, verdict: Verdict) -> None:
+        """The channel has resolved frames, those of each sender in the order in which they were sent."""
         mask = verdict.mask(self._agents)
         nothing = (0,) * len(verdict.senders)
         for row, sender in enumerate(verdict.senders):
-            if waiting := self._unjudged.get(sender):
+            if waiting := self._unresolved.get(sender):
                 lost, collided = (values[row] for values in (verdict.lost or nothing, verdict.collided or nothing))
                 waiting.popleft().verdict = mask[row], lost, collided
 
     def add_report(self, message: Fields) -> None:
-        """Agents of one process report slots, and what they took in."""
+        """Agents of one process report slots, and the frames that they received."""
         at, count = np.array(message.agent, np.intp) - 1, len(message.agent)
         for row, slot in enumerate(message.slot.tolist()):
             account = self._account(slot)
-            if account is None or account.known[at].any():
-                continue  # too late, or told twice
-            account.known[at] = True
-            part = slice(row * count, (row + 1) * count)
-            account.sent[at] = np.asarray(message.length)[part] > 0
-            for name, values in account.decided.items():
-                values[at] = getattr(message, name)[part]
-            account.track[:, :, at] = _plane(message.track, row, self._steps, count)
-            for name, values in account.vectors.items():
-                values[:, at] = _plane(getattr(message, name), row, 1, count)[0]
-        if len(message.heard_sender):
-            masks = np.unpackbits(message.heard_by.reshape(-1, -(-count // 8)), axis=1, count=count, bitorder="little")
-            columns = message.heard_in, message.heard_sender, message.heard_slot, message.heard_ns
-            for here, sender, slot, at_ns, mask in zip(*(c.tolist() for c in columns), masks, strict=True):
-                account = self._account(here)
-                if account is not None:
-                    by = np.zeros(self._agents, np.bool_)
-                    by[at] = mask
-                    account.heard.append((sender, slot, at_ns, by))
+            if account is not None and not account.answered[at].any():  # else too late, or reported twice
+                account.add_report(at, message, row)
+                account.sent[at] = message.length[row * count : (row + 1) * count] > 0
+        for slot, sender, here, at_ns, mask in received_in(message):
+            account = self._account(here)
+            if account is not None:
+                receivers = np.zeros(self._agents, np.bool_)
+                receivers[at] = mask
+                account.heard.append((sender, slot, at_ns, receivers))
 
     def pop(self, closed: int, at_end: bool) -> list[tuple[int, dict[str, Any]]]:
         """The fields of records for which nothing is waited for any more, by slot.
@@ -260,18 +249,18 @@ class RealtimeAccounts:
         return found
 
     def _is_whole(self, slot: int) -> bool:
-        """Whether all agents have reported a slot, and what they took in during it, and its frames are judged."""
+        """Whether all agents have reported a slot, and the frames of it, which are all resolved."""
         here, after = self._open.get(slot), self._open.get(slot + 1)
         if here is None or after is None:
             return False
-        silent = set((np.flatnonzero(~(here.known & after.known)) + 1).tolist())
+        silent = set((np.flatnonzero(~(here.answered & after.answered)) + 1).tolist())
         if silent - self.lost:
             return False
-        return all(frame.verdict is not None for frame in here.frames.values())
+        return all(frame.verdict is not None for frame in here.sent_frames.values())
 
     def _fields(self, slot: int, account: _Account) -> dict[str, Any]:
-        start_ns, here = slot * self._slot_ns, np.flatnonzero(account.known)
-        frames = {agent: frame for agent, frame in sorted(account.frames.items()) if frame.verdict is not None}
+        start_ns, here = slot * self._slot_ns, np.flatnonzero(account.answered)
+        frames = {agent: frame for agent, frame in sorted(account.sent_frames.items()) if frame.verdict is not None}
         verdicts = [frame.verdict for frame in frames.values() if frame.verdict is not None]
         received = np.array([verdict[0] for verdict in verdicts]) if verdicts else None
         heard, unrecorded = account.heard, account.sent.copy()
@@ -279,8 +268,7 @@ class RealtimeAccounts:
         presence = PRESENT + UNRECORDED * unrecorded[here] if unrecorded.any() else []
         return {
             "outcome": (COLLISION if any(v[2] for v in verdicts) else SUCCESS) if verdicts else IDLE,
-            "agent": here + 1, "presence": presence, **{name: values[here] for name, values in account.decided.items()},
-            "track": account.track[:, :, here], **{name: v[:, here] for name, v in account.vectors.items()},
+            "agent": here + 1, "presence": presence, **{name: getattr(account, name)[..., here] for name in _REPORTED},
             **frame_fields({agent: frame.data for agent, frame in frames.items()}, received),
             "sent_ns": [frame.start_ns - start_ns for frame in frames.values()],
             "lost": [verdict[1] for verdict in verdicts], "collided": [verdict[2] for verdict in verdicts],
@@ -288,12 +276,6 @@ class RealtimeAccounts:
             "heard_ns": [entry[2] - start_ns for entry in heard],
             "heard_by": np.frombuffer(pack_received(np.array([e[3] for e in heard])), np.uint8) if heard else [],
         }  # fmt: skip
-
-
-def _plane(values: NDArray[np.float64], row: int, steps: int, count: int) -> NDArray[np.float64]:
-    """Vectors of a row, (steps, 3, n)."""
-    size = 3 * steps * count
-    return values[row * size : (row + 1) * size].reshape(steps, 3, count)
 
 
 def _parameter_event(time_ns: int, node: str, change: Change) -> bytes:

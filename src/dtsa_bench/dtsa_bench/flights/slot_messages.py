@@ -12,9 +12,8 @@ from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from dtsa_agent.core import REASONS, Scenario
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.cdr import Message
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import CdrMessage, pack_received
 from dtsa_bench.log.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPacker
 from dtsa_bench.log.record import frame_fields, pack_record
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
@@ -23,16 +22,16 @@ from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 
 _ACCOUNT = ("chosen", "reason", "digest", "score", "track", "velocity", "command", "goal")
 _KNOWN = 256  # combinations of reasons whose texts are kept
-_RECEPTION = Message({
+_RECEPTION = CdrMessage({
     "run": "I", "slot": "I", "outcome": "B", "sender": "*H", "received": "*B", "lost": "*H", "collided": "*H",
 })  # fmt: skip
 
 
 @lru_cache(256)
-def _decision(count: int) -> Message:
+def _decision(count: int) -> CdrMessage:
     """Decision messages with this many names of reasons."""
     texts = dict.fromkeys((f"name {place}" for place in range(count)), "*B")
-    return Message({
+    return CdrMessage({
         "run": "I", "slot": "I", "agent": "*H", "chosen": "*H", "names": "I", **texts, "index": "*B", "reason": "*B",
         "digest": "*I", "score": "*d",
     })  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dtsa_agent.core.delays import Delays
-from dtsa_agent.ros.common.wire.messages import Fields
+from dtsa_agent.ros.common.messages import Fields
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver
@@ -27,8 +27,8 @@ class DeliveryStatistics(ChannelObserver):
     def __init__(self, agents: int) -> None:
         self._agents, self._delays = agents, Delays(agents)
 
-    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        for taken in answers.taken_in or ():
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+        for taken in answers.receipts or ():
             receivers = np.flatnonzero(taken.mask)
             self._delays.add_many(taken.at_ns[receivers] - taken.arrival_ns, receivers)
 
@@ -50,8 +50,8 @@ def channel_summary(channel: RealtimeChannel) -> dict[str, Any]:
     """How the channel kept up."""
     pace = channel.pace
     return {
-        "late_frames": channel.late_frames,
-        "missed_reports": channel.missed,
+        "late_frames": channel.air.late,
+        "missed_reports": channel.accounts.missed,
         "round_ms": channel.round_ms,
         "channel_lag_p99_ms": pace.lag.quantile_ms(0.99),
         "channel_lag_max_ms": pace.lag.largest_ms(),
@@ -72,7 +72,7 @@ def tight(channel: RealtimeChannel) -> str:
 
 def warning(channel: RealtimeChannel, summary: dict[str, Any]) -> str | None:
     """Why figures of a flight describe the machine rather than the protocol; None if they do not."""
-    frames = max(1, channel.pace.lag.count() + channel.late_frames)
+    frames = max(1, channel.pace.lag.count() + channel.air.late)
     entries = max(1, summary["slots"]["total"] * channel.agents)
     lag, on_time = summary["channel_lag_p99_ms"], summary["sends_on_time_share"]
     longest = max((end - begin for begin, end in summary["stalls"]), default=0.0)
@@ -83,8 +83,8 @@ def warning(channel: RealtimeChannel, summary: dict[str, Any]) -> str | None:
             (channel.fell_behind, bool(channel.fell_behind)),
             (f"the channel stood still {summary['stall_count']} times, for up to {longest:.2f} s", longest > 0.0),
             (f"the channel's lag is {lag or 0.0:.1f} ms (p99)", lag is not None and lag * 1e6 > _LAG * channel.slot_ns),
-            (f"{channel.late_frames} frames came too late", channel.late_frames > _LATE * frames),
-            (f"{channel.missed} entries of reports came too late", channel.missed > _LATE * entries),
+            (f"{channel.air.late} frames came too late", channel.air.late > _LATE * frames),
+            (f"{channel.accounts.missed} entries of reports came too late", channel.accounts.missed > _LATE * entries),
             (f"{on_time or 0.0:.1%} of the frames left on time", on_time is not None and on_time < _ON_TIME),
         )
         if wrong

@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.station import check_joinable
-from dtsa_agent.ros.common.graph.names import named
+from dtsa_agent.ros.common.names import agent_names
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 from dtsa_channel_sim.ros.roster import LOST_AFTER_S
@@ -48,15 +48,10 @@ class RealtimeSupervisor(ChannelObserver):
     """
 
     def __init__(
-        self,
-        children: Children,
-        channel: RealtimeChannel,
-        measurement: FlightMeasurement,
-        say: Callable[[str], None],
-        respawn_s: float | None = None,
-        late: Sequence[LateStart] = (),
-    ) -> None:
-        self._children, self._channel, self._measurement, self._say = children, channel, measurement, say
+        self, children: Children, channel: RealtimeChannel, measurement: FlightMeasurement,
+        print_line: Callable[[str], None], respawn_s: float | None = None, late: Sequence[LateStart] = (),
+    ) -> None:  # fmt: skip
+        self._children, self._channel, self._measurement, self._print = children, channel, measurement, print_line
         self._respawn_s = respawn_s
         self._late = sorted(late, key=lambda start: start.after_s)
         self._dead: list[tuple[float, Child]] = []  # time.monotonic() at which each is started again
@@ -65,30 +60,30 @@ class RealtimeSupervisor(ChannelObserver):
             measurement.metrics.awaited.add(start.agent)
             channel.expect_later(start.agent, measurement.scenario.start[:, start.agent - 1])
 
-    def begun(self, at_s: float) -> None:
+    def start_known(self, at_s: float) -> None:
         if text := tight(self._channel):
-            self._say(text)
+            self._print(text)
 
     def idle(self, status: ChannelStatus) -> None:
         begin_s = self._measurement.begin_s
         for child in self._children.ended():
             if not begin_s:
                 self._children.check()
-            self._miss(child)
+            self._report_end(child)
         while self._dead and time.monotonic() >= self._dead[0][0]:
-            self._start_again(self._dead.pop(0)[1])
+            self._restart(self._dead.pop(0)[1])
         while self._late and begin_s and time.monotonic() - begin_s >= self._late[0].after_s:
             start = self._late.pop(0)
             start.start()
-            self._say(f"{named([start.agent])} is started")
+            self._print(f"{agent_names([start.agent])} is started")
 
-    def _miss(self, child: Child) -> None:
+    def _report_end(self, child: Child) -> None:
         """Takes note that a process has ended.
 
         :raises NodeError: when nobody is left.
         """
         left = not child.process.returncode
-        self._say(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
+        self._print(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
         for agent in child.agents:
             self._channel.lose(agent)
         if self._respawn_s is not None and not left:
@@ -97,11 +92,11 @@ class RealtimeSupervisor(ChannelObserver):
         if len(self._channel.lost) == self._channel.agents and not self._dead and not self._late:
             raise NodeError(f"nobody is left: {describe_end(child)}")
 
-    def _start_again(self, child: Child) -> None:
+    def _restart(self, child: Child) -> None:
         """Starts the program of some agents again; their vehicles have gone on hovering where they were."""
         places = [value for agent in child.agents for value in self._channel.last_place(agent)]
-        self._children.again(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
-        self._say(f"{child.name} is started again")
+        self._children.restart(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
+        self._print(f"{child.name} is started again")
 
     def follow_parameters(self, node: Node) -> None:
         """Let parameters of the channel's node kill and start the processes of agents, as faults would."""
@@ -133,7 +128,7 @@ class RealtimeSupervisor(ChannelObserver):
         check_joinable(self._measurement.metrics.run.swarm.policy)
         self._dead = [entry for entry in self._dead if entry[1] is not child]
         self._measurement.metrics.awaited.update(child.agents)
-        self._start_again(child)
+        self._restart(child)
 
     def _child(self, agent: int) -> Child | None:
         return next((child for child in self._children.all if agent in child.agents), None)
@@ -141,9 +136,9 @@ class RealtimeSupervisor(ChannelObserver):
     def agents_back(self, agents: list[int]) -> None:
         again = "" if self._new.issuperset(agents) else " again"
         self._new.difference_update(agents)
-        self._say(f"{named(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
+        self._print(f"{agent_names(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
 
     def agent_silent(self, agent: int) -> None:
         known = {agent for child in self._children.all if child.process.poll() is not None for agent in child.agents}
         if agent not in known | {start.agent for start in self._late}:
-            self._say(f"{named([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")
+            self._print(f"{agent_names([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")

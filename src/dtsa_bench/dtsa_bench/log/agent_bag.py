@@ -26,15 +26,15 @@ from mcap.writer import CompressionType, Writer
 from rosbags.serde import SerdeError
 from zstandard import ZstdError
 
-from dtsa_agent.air.datagram import flight_ns, frame_in
+from dtsa_agent.air.port import flight_ns, frame_in
 from dtsa_agent.air.port import PortProperties, PortSettings
-from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import TAG_LENGTH
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench import __version__
 from dtsa_bench.log.arrays import NEW
 from dtsa_bench.log.record import (
@@ -173,7 +173,7 @@ class AgentRecorder:
         if len(self._slots) >= _AT_A_TIME:
             self._write_slots()
 
-    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
+    def refused(self, reason: str, data: bytes, arrival_ns: int) -> None:
         """A datagram has not been accepted: the agent's summary counts these."""
 
     def _write_slots(self) -> None:
@@ -187,7 +187,7 @@ class AgentRecorder:
         sent = {self._id: record.datagram} if is_sent else {}
         return pack_record(
             self._config.auth_session or 1, record.slot, zero_ns - self._zero_ns + names.TIME_ZERO_NS,
-            len(record.track), agent=[self._id], presence=[record.present | (NEW if record.anew else 0)],
+            len(record.track), agent=[self._id], presence=[record.present | (NEW if record.is_first else 0)],
             chosen=[record.chosen], reason=[record.reason], digest=[record.digest], score=[record.score],
             offset_ns=[record.sent_ns - zero_ns if is_sent else 0], track=record.track, velocity=record.velocity,
             command=record.command, goal=record.goal, **frame_fields(sent, None),
@@ -358,7 +358,7 @@ def _add_slot(bag: AgentBag, said: Any) -> None:
     frames = cut_frames(said.heard_data, said.heard_length, len(said.heard_sender))
     is_before = said.heard_before.tolist() or [0] * len(frames)
     columns = zip(said.heard_sender.tolist(), said.heard_slot.tolist(), said.heard_ns.tolist(), frames, strict=True)
-    heard = [Heard(sender, slot, start_ns + at_ns, data, True) for sender, slot, at_ns, data in columns]
+    heard = [ReceivedFrame(sender, slot, start_ns + at_ns, data, True) for sender, slot, at_ns, data in columns]
     datagram = said.data.tobytes() if is_sent else b""
     frame = frame_in(datagram, bag.swarm)
     record = SlotRecord(
@@ -369,6 +369,6 @@ def _add_slot(bag: AgentBag, said: Any) -> None:
         before=[one for one, early in zip(heard, is_before, strict=True) if early],
         heard=[one for one, early in zip(heard, is_before, strict=True) if not early],
     )  # fmt: skip
-    if bag.slots and record.slot <= bag.slots[-1].slot and not record.anew:
+    if bag.slots and record.slot <= bag.slots[-1].slot and not record.is_first:
         raise UnusableBag(bag.path, f"slot {record.slot} comes after slot {bag.slots[-1].slot}")
     bag.slots.append(record)

@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.air.datagram import NETWORK, frame_in
-from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.port import NETWORK, frame_in
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench.log.arrays import NEW, UNKNOWN
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.knowledge import Ages, Knowledge, ObservedPairs
@@ -152,7 +152,7 @@ def _with_times(bag: AgentBag, to_common: Callable[[int], int]) -> AgentBag:
     """A bag whose times are those of the line."""
 
     def move(record: SlotRecord) -> SlotRecord:
-        def arrived(frames: Sequence[Heard]) -> list[Heard]:
+        def arrived(frames: Sequence[ReceivedFrame]) -> list[ReceivedFrame]:
             return [dataclasses.replace(heard, arrival_ns=to_common(heard.arrival_ns)) for heard in frames]
 
         return dataclasses.replace(
@@ -224,7 +224,7 @@ def slot_fields(flight: MergedFlight) -> Iterator[tuple[int, dict[str, Any]]]:
         track = np.stack([record.track for record in records.values()], axis=2) if records else np.zeros(0)
         yield slot, {
             "outcome": outcome, "steps": config.steps, "agent": list(records),
-            "presence": [record.present | (NEW if record.anew else 0) for record in records.values()],
+            "presence": [record.present | (NEW if record.is_first else 0) for record in records.values()],
             **{name: [getattr(record, name) for record in records.values()]
                for name in ("chosen", "reason", "digest", "score")},
             "offset_ns": [(r.sent_ns if r.datagram else r.start_ns) - start_ns for r in records.values()],
@@ -239,7 +239,7 @@ def slot_fields(flight: MergedFlight) -> Iterator[tuple[int, dict[str, Any]]]:
         }  # fmt: skip
 
 
-def _other_frame(heard: Heard, frames: Mapping[int, Mapping[int, tuple[int, bytes]]], config: SwarmConfig) -> bytes:
+def _other_frame(heard: ReceivedFrame, frames: Mapping[int, Mapping[int, tuple[int, bytes]]], config: SwarmConfig) -> bytes:
     """A frame that was heard, if the log has another one of its sender and slot; else nothing."""
     data = frame_in(heard.datagram, config)
     return b"" if frames[heard.slot][heard.sender][1] == data else data

@@ -17,8 +17,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.base import TypesysError
 
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import pack_received, unpack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import pack_received, unpack_received
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM

@@ -7,10 +7,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtsa_agent.air.datagram import link_of
-from dtsa_agent.air.port import PortProperties
+from dtsa_agent.air.driver import AgentVehicle
+from dtsa_agent.air.port import PortProperties, link_of
 from dtsa_agent.air.record import SlotRecord
-from dtsa_agent.air.vehicle import SimulatedVehicle
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.frame import condition_in
 from dtsa_agent.core.station import BETWEEN, StationSettings
@@ -35,52 +34,46 @@ def _settled_after(config: SwarmConfig) -> int:
     return (2 * config.main_every if config.policy_row.probation else 1) * config.agents
 
 
-class HeldVehicle(SimulatedVehicle):
-    """A vehicle that stays where it is, whatever its agent wants; it is never at its goal, so that all speak alike."""
-
-    def sense(self, swarm: Swarm) -> None:
-        """An agent at its goal would rest, and speak seldom: it says that it is below it."""
-        away = swarm.goal[:, 0] - swarm.position[:, 0]
-        if float(away @ away) <= swarm.config.r_min**2:
-            swarm.position[2, 0] -= 2.0 * swarm.config.r_min
+class HeldVehicle(AgentVehicle):
+    """A vehicle that stays where it is, whatever its agent wants."""
 
     def fly(self, swarm: Swarm, slot: int) -> None:
         """Nothing."""
 
 
 @dataclass(slots=True)
-class _Other:
+class _OtherAgent:
     """What was heard of another agent."""
 
-    left: bool = False  # has said that it leaves: its check is over
-    new: bool = True  # on probation: it speaks at its anchors only, or in turns of which others need not know yet
-    expected: set[int] = field(default_factory=set)  # slots in which it was taken for the sender
+    left: bool = False  # has announced that it leaves: its check is over
+    new: bool = True  # on probation: it sends at its anchors only, or in turns of which others need not know yet
+    expected: set[int] = field(default_factory=set)  # slots in which it was to send
     came: set[int] = field(default_factory=set)  # slots of its frames
     in_time: set[int] = field(default_factory=set)
     delays_ns: list[int] = field(default_factory=list)
-    says: dict[int, int] = field(default_factory=dict)  # by id: how often it said to hear it, less how often not
+    hears_count: dict[int, int] = field(default_factory=dict)  # by id: how often it announced that, less not
 
     def hears(self, agent: int) -> bool | None:
-        """Whether it hears another one: what it said more often, for others may end their check before it."""
-        return self.says[agent] > 0 if agent in self.says else None
+        """Whether it hears another one: what it announced more often, for others may end their check before it."""
+        return self.hears_count[agent] > 0 if agent in self.hears_count else None
 
 
 class Check:
-    """A watcher of an agent that only listens and speaks."""
+    """A watcher of an agent whose vehicle is held."""
 
     def __init__(self, agent: int, config: SwarmConfig, port: PortProperties) -> None:
         self._agent, self._config = agent, config
         self._datagrams = StationSettings(config, link_of(config, port), authenticator(config))
-        self._others: dict[int, _Other] = {}
+        self._others: dict[int, _OtherAgent] = {}
         self._refused: Counter[str] = Counter()
         self._last = -1
-        self._slots = 0  # since it began, or began anew
+        self._slots = 0  # since it began or restarted
         self._settled = _settled_after(config)
-        self._expects = False  # whether the policy says at all who is to send
+        self._expects = False  # whether the policy expects senders at all
 
     def slot(self, record: SlotRecord) -> None:
         """A slot is over."""
-        if record.anew:  # another time: what was heard before counts its slots differently
+        if record.is_first:  # another time: what was heard before counts its slots differently
             self._others.clear()
             self._slots = 0
         self._slots, self._last = self._slots + 1, record.slot
@@ -89,20 +82,20 @@ class Check:
             other = self._of(record.chosen)
             if self._slots > self._settled and not other.new:
                 other.expected.add(record.slot)
-        for one in (*record.before, *record.heard):
-            other = self._of(one.sender)
-            other.came.add(one.slot)
-            delay = one.arrival_ns - record.start_ns - (one.slot - record.slot) * self._config.slot_ns
+        for frame in (*record.before, *record.heard):
+            other = self._of(frame.sender)
+            other.came.add(frame.slot)
+            delay = frame.arrival_ns - record.start_ns - (frame.slot - record.slot) * self._config.slot_ns
             other.delays_ns.append(delay)
             if delay <= (1.0 - BETWEEN) * self._config.slot_ns:
-                other.in_time.add(one.slot)
-            self._read(other, one.datagram)
+                other.in_time.add(frame.slot)
+            self._read(other, frame.datagram)
 
-    def _of(self, agent: int) -> _Other:
-        return self._others.setdefault(agent, _Other())
+    def _of(self, agent: int) -> _OtherAgent:
+        return self._others.setdefault(agent, _OtherAgent())
 
-    def _read(self, other: _Other, datagram: bytes) -> None:
-        """Whether the sender is new, and whom it says to hear."""
+    def _read(self, other: _OtherAgent, datagram: bytes) -> None:
+        """Note whether the sender is new, and which agents it announces to hear."""
         parsed = self._datagrams.read(datagram)
         other.left, _, other.new = condition_in(parsed.frame)
         if other.left or not self._datagrams.names:  # an agent that leaves need hear nobody
@@ -110,20 +103,17 @@ class Check:
         for agent in range(1, self._config.agents + 1):
             hears = self._datagrams.hears(parsed.names, agent)
             if agent != parsed.sender and hears is not None:
-                other.says[agent] = other.says.get(agent, 0) + (1 if hears else -1)
+                other.hears_count[agent] = other.hears_count.get(agent, 0) + (1 if hears else -1)
 
-    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
-        """A datagram has not been taken in.
-
-        :param data: its bytes.
-        """
+    def refused(self, reason: str, data: bytes, arrival_ns: int) -> None:
+        """A datagram was not accepted."""
         self._refused[reason] += 1
 
     def result(self) -> dict[str, Any]:
         """What was found, as plain values; ``missing``: what keeps all from hearing all in time, a line each."""
-        others = {agent: self._told(agent) for agent in range(1, self._config.agents + 1) if agent != self._agent}
+        others = {agent: self._describe(agent) for agent in range(1, self._config.agents + 1) if agent != self._agent}
         heard_by = [k for k in others if any(other.hears(k) for other in self._others.values())]
-        lost = {k for k, told in others.items() if not told["heard"] and k not in heard_by}
+        lost = {k for k, row in others.items() if not row["heard"] and k not in heard_by}
         missing = [f"cf{k} is heard by no agent" for k in sorted(lost)]
         for agent in sorted(others.keys() - lost):
             missing += self._missing(agent, others[agent], lost)
@@ -132,13 +122,13 @@ class Check:
             "agents": self._config.agents,
             "slot_ms": self._config.slot_ms,
             "slots": self._slots,
-            "others": {f"cf{agent}": told for agent, told in others.items()},
+            "others": {f"cf{agent}": row for agent, row in others.items()},
             "not_taken_in": dict(sorted(self._refused.items())),
             "missing": missing,
         }
 
-    def _told(self, agent: int) -> dict[str, Any]:
-        other = self._others.get(agent, _Other())
+    def _describe(self, agent: int) -> dict[str, Any]:
+        other = self._others.get(agent, _OtherAgent())
         counted = {slot for slot in other.expected if slot <= max(other.came, default=-1)}  # until it ended its check
         delays = [delay / 1e6 for delay in other.delays_ns]
         return {
@@ -149,38 +139,38 @@ class Check:
             "delay_ms": {"p50": statistics.median(delays), "max": max(delays)} if delays else None,
             "silent_slots": 0 if other.left or not other.came else self._last - max(other.came),
             "hears_this_agent": other.hears(self._agent),
-            "does_not_hear": sorted(k for k in other.says if not other.hears(k) and k != self._agent),
+            "does_not_hear": sorted(k for k in other.hears_count if not other.hears(k) and k != self._agent),
         }
 
-    def _missing(self, agent: int, told: dict[str, Any], lost: set[int]) -> list[str]:
+    def _missing(self, agent: int, row: dict[str, Any], lost: set[int]) -> list[str]:
         """What is missing between an agent and others, but for those that no agent hears."""
-        if not told["heard"]:
+        if not row["heard"]:
             return [f"cf{agent} is not heard"]
-        found, share = [], told["in_time_share"]
-        if told["silent_slots"] > max(_SILENT * self._slots, self._config.turn_every * self._config.agents):
-            found.append(f"cf{agent} was not heard in the last {told['silent_slots']} slots")
-        elif self._expects and told["expected"] < _FEWEST:
-            found.append(f"of cf{agent} {told['expected']} frames were expected, too few to tell: check for longer")
+        found, share = [], row["in_time_share"]
+        if row["silent_slots"] > max(_SILENT * self._slots, self._config.turn_every * self._config.agents):
+            found.append(f"cf{agent} was not heard in the last {row['silent_slots']} slots")
+        elif self._expects and row["expected"] < _FEWEST:
+            found.append(f"of cf{agent} {row['expected']} frames were expected, too few to tell: check for longer")
         elif share is not None and share < ENOUGH:
-            found.append(f"{share:.0%} of {told['expected']} frames of cf{agent} heard in time, {ENOUGH:.0%} needed")
-        if told["hears_this_agent"] is False:
+            found.append(f"{share:.0%} of {row['expected']} frames of cf{agent} heard in time, {ENOUGH:.0%} needed")
+        if row["hears_this_agent"] is False:
             found.append(f"cf{agent} does not hear cf{self._agent}")
-        if told["hears_this_agent"] is None and self._datagrams.names:
+        if row["hears_this_agent"] is None and self._datagrams.names:
             found.append(f"cf{agent} has not said yet that it hears cf{self._agent}")
-        return found + [f"cf{agent} does not hear cf{k}" for k in told["does_not_hear"] if k not in lost]
+        return found + [f"cf{agent} does not hear cf{k}" for k in row["does_not_hear"] if k not in lost]
 
 
 def table(result: dict[str, Any]) -> str:
     """The result for people."""
     head = ("", "frames", "heard", "in time", "delay ms", "largest", f"hears cf{result['id']}", "does not hear")
     rows = [head]
-    for name, told in result["others"].items():
-        delay = told["delay_ms"]
+    for name, row in result["others"].items():
+        delay = row["delay_ms"]
         rows.append((
-            name, str(told["heard"]), _percent(told["heard_share"]), _percent(told["in_time_share"]),
+            name, str(row["heard"]), _percent(row["heard_share"]), _percent(row["in_time_share"]),
             f"{delay['p50']:.2f}" if delay else "-", f"{delay['max']:.2f}" if delay else "-",
-            {True: "yes", False: "no", None: "-"}[told["hears_this_agent"]],
-            ", ".join(f"cf{k}" for k in told["does_not_hear"]) or "-",
+            {True: "yes", False: "no", None: "-"}[row["hears_this_agent"]],
+            ", ".join(f"cf{k}" for k in row["does_not_hear"]) or "-",
         ))  # fmt: skip
     widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
     lines = ["  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dtsa_agent.air.driver import LiveAgent
-from dtsa_agent.air.port import PortSettings
-from dtsa_agent.air.ports import open_port
+from dtsa_agent.air.port import PortSettings, open_port
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.stop import Stop
@@ -42,15 +41,15 @@ def check(job: AgentJob, seconds: float) -> int:
 
     duration = seconds or lasts_s(job.config)
     own = dataclasses.replace(job.own, duration_s=duration, quorum="0")  # it hovers anyway
-    say = _Terminal(own.id).say
-    say(f"checks for {duration:.0f} s who is heard; its vehicle is held")
+    log = _Terminal(own.id).log
+    log(f"checks for {duration:.0f} s who is heard; its vehicle is held")
     watcher = Check(own.id, job.config, job.port.properties)
     with Stop() as stop, open_port(job.port) as port:
-        LiveAgent(own, job.config, port, watcher, HeldVehicle(), say=say).run(stop)
+        LiveAgent(own, job.config, port, watcher, HeldVehicle(), log=log).run(stop)
     result = watcher.result()
     print(json.dumps(result, indent=2) + "\n" if job.as_json else table(result), end="")
     if result["missing"]:
-        say(f"not all hear all in time: {'; '.join(result['missing'])}")
+        log(f"not all hear all in time: {'; '.join(result['missing'])}")
     return int(bool(result["missing"]))
 
 
@@ -62,9 +61,10 @@ def fly(job: AgentJob) -> int:
     """
     failure = ""
     terminal = _Terminal(job.own.id)
-    say = terminal.say
     with Stop() as stop, open_port(job.port) as port:
-        agent = LiveAgent(job.own, job.config, port, say=say, show=terminal.show if sys.stderr.isatty() else None)
+        agent = LiveAgent(
+            job.own, job.config, port, log=terminal.log, show=terminal.show if sys.stderr.isatty() else None
+        )
         if job.out is None:
             agent.run(stop)
             summary = agent.summary()
@@ -84,7 +84,7 @@ def fly(job: AgentJob) -> int:
     problem = hearing.problem(not_taken_in) if hearing.delivered else ""  # who is alone hears nobody
     problem = problem or summary["never_flew"]
     if problem:
-        say(problem)
+        terminal.log(problem)
     if failure:
         from dtsa_bench.log.bag.errors import BagError
 
@@ -120,7 +120,7 @@ class _Terminal:
     def __init__(self, agent: int) -> None:
         self._agent, self._shown = agent, False
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Prints a line that stays."""
         self.clear()
         print(f"dtsa: cf{self._agent}: {line}", file=sys.stderr, flush=True)

@@ -11,14 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.datagram import frame_in, link_of
-from dtsa_agent.air.port import PortSettings
-from dtsa_agent.air.ports import open_listener
+from dtsa_agent.air.port import PortSettings, frame_in, link_of, open_port
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.station import OTHER_TIME, REPEATED, StationSettings
 from dtsa_agent.keys import authenticator
-from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common import names
 from dtsa_agent.stop import Stop
 from dtsa_bench.log.agent_bag import RecordFile
 from dtsa_bench.log.record import SNIFFER, frame_fields, pack_record
@@ -31,21 +29,18 @@ _WAITS = 2  # slots that are kept open for frames that come late
 
 
 class Sniffer:
-    """One who listens.
+    """A listener.
 
     :param path: file for what was heard; None: it is only judged.
-    :param say: is told a line when the port fails or is back; None: nobody is.
-    :raises ConfigError: for a port that cannot be used, or without the key of sealed frames.
+    :param log: prints a line when the port fails or is back; None: nothing is printed.
+    :raises ConfigError: for a port that cannot be used, or without the key of signed frames.
     :raises BagError: if the file cannot be made.
     """
 
     def __init__(
-        self,
-        config: SwarmConfig,
-        port: PortSettings,
-        path: Path | None = None,
-        say: Callable[[str], None] | None = None,
-    ) -> None:
+        self, config: SwarmConfig, port: PortSettings, path: Path | None = None,
+        log: Callable[[str], None] | None = None,
+    ) -> None:  # fmt: skip
         self._config, self._judge = config, Judge(config)
         self._datagrams = StationSettings(config, link_of(config, port.properties), authenticator(config))
         self._slots: dict[int, dict[int, tuple[int, bytes]]] = {}  # not judged yet: by sender, when it came, and what
@@ -53,8 +48,8 @@ class Sniffer:
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
         self._zero_ns = time.monotonic_ns()
-        self._listener: Any = open_listener(port)
-        self._listener.say = say
+        self._listener: Any = open_port(port)
+        self._listener.log = log
         about = {"port": dataclasses.asdict(port.properties), "port_settings": port.to_dict(), "zero_ns": self._zero_ns}
         try:
             self.bag = None if path is None else RecordFile(path, config, {SNIFFER: json.dumps(about, sort_keys=True)})
@@ -71,11 +66,11 @@ class Sniffer:
         while not stop and not (seconds and time.monotonic() >= end):
             select.select([self._listener], [], [], _PATIENCE_S)
             for datagram in self._listener.receive(_BURST):
-                self._take(datagram.data, datagram.arrival_ns)
+                self._receive(datagram.data, datagram.arrival_ns)
         for slot in sorted(self._slots):
             self._close_slot(slot)
 
-    def _take(self, data: bytes, arrival_ns: int) -> None:
+    def _receive(self, data: bytes, arrival_ns: int) -> None:
         sender, slot, reason = self._read(data)
         if reason:
             self.refused[reason] += 1

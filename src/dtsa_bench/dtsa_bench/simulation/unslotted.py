@@ -283,7 +283,7 @@ class UnslottedTraffic:
         self._carried.lengths.append(length)
 
     def _settle(self, until_ns: int) -> None:
-        for verdict in self._air.settle(until_ns, self._swarm.position):
+        for verdict in self._air.resolve(until_ns, self._swarm.position):
             packet = self._on_air.pop(verdict.frame_id)
             if verdict.received.any():
                 heappush(self._arriving, (verdict.arrival_ns, verdict.frame_id, packet, verdict.received))

@@ -14,8 +14,8 @@ from node_helpers import end_of, ros_graph
 pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.workarounds.dds import RANGE
+from dtsa_agent.ros.common.node_process import RANGE
+from dtsa_agent.stop import Stop
 from dtsa_bench.commands.cli import main
 from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.domain import clear_hindrances, ros_domain

@@ -28,8 +28,8 @@ from dtsa_agent.core import Frame as OwnState
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.frame import ExtendedFrame, encode_extended
 from dtsa_agent.core.settings.config import agreed_settings, settings_hash
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.messages import header_of
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.messages import header_of
 from dtsa_bench.log.record import load_log
 from dtsa_bench.log.verify.check import verify_bag
 

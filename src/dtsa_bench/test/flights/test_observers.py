@@ -23,9 +23,9 @@ from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
 from dtsa_agent.core.frame import encode_frame
 from dtsa_agent.core.settings.config import settings_hash
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.loop import Feed
-from dtsa_agent.ros.common.wire.messages import header_of
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.messages import header_of
 from dtsa_bench.flights import measurement
 from dtsa_bench.flights.measurement import PositionLog
 from dtsa_bench.flights.recorded_channel import RecordedFlight
@@ -52,7 +52,7 @@ class Diary(ChannelObserver):
     def all_answered(self, slot: int, answers: Answers) -> None:
         self.pages.append(f"{self.name}answered {slot}")
 
-    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         assert sorted(frames) == list(verdict.senders)
         self.pages.append(f"{self.name}judged {slot}")
 
@@ -160,7 +160,7 @@ class LateSender(ChannelObserver):
         self._begin_s = 0.0
         self.frames: list[tuple[int, list[bool], int]] = []  # sender, received, collided
 
-    def begun(self, at_s: float) -> None:
+    def start_known(self, at_s: float) -> None:
         self._begin_s = at_s
 
     def idle(self, status: ChannelStatus) -> None:
@@ -187,7 +187,7 @@ class LateSender(ChannelObserver):
             )
         )  # fmt: skip
 
-    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         for row, sender in enumerate(verdict.senders):
             self.frames.append((sender, verdict.received[row].tolist(), verdict.collided[row]))
 
@@ -216,8 +216,8 @@ class LateAnswers(LateSender):
         self.late: list[int] = []
         self.places: set[float] = set()
 
-    def begun(self, at_s: float) -> None:
-        super().begun(at_s)
+    def start_known(self, at_s: float) -> None:
+        super().start_known(at_s)
         while (message := self.slots.take()) is not None:
             if message.phase == Slot.PREPARE and message.slot != names.FIRST_CALL:
                 self.late.append(message.slot)
@@ -264,7 +264,7 @@ def test_who_is_late_with_its_first_report_is_where_it_was_when_it_was_called(tm
 @pytest.mark.realtime
 def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_path: Path) -> None:
     channel, sender = flown_with(LateSender, tmp_path, slots=150)
-    assert channel.air.late == channel.late_frames == 1
+    assert channel.air.late == 1
     # That of agent 1 disturbed nobody; agent 2 was heard by the one other agent.
     assert sender.frames == [(2, [True, False], 0)]
 

@@ -155,8 +155,8 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
     from dtsa_msgs.msg import Slot
     from node_helpers import end_of, ros_graph
 
-    from dtsa_agent.ros.common.graph import names
-    from dtsa_agent.ros.common.process.runs import Run
+    from dtsa_agent.ros.common import names
+    from dtsa_agent.ros.common.runs import Run
 
     with ros_graph(tmp_path) as graph:
         channel = graph.node.create_publisher(Slot, "/swarm/slot", names.lockstep_qos(4))

@@ -17,7 +17,7 @@ import yaml
 from bag_helpers import typestore
 from rosbags.interfaces import Nodetype
 
-from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common import names
 
 SHARE = Path(__file__).resolve().parents[2]
 LAYOUTS = Path(__file__).resolve().parents[4] / "layouts"

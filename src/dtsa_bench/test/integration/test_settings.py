@@ -127,7 +127,7 @@ def test_settings_survive_plain_values_json_and_yaml(cls: type[Settings], data: 
 @MANY
 @given(data=st.data())
 def test_settings_survive_a_file_of_ros_parameters(cls: type[Settings], data: st.DataObject) -> None:
-    parameters = pytest.importorskip("dtsa_agent.ros.common.graph.parameters")
+    parameters = pytest.importorskip("dtsa_agent.ros.common.parameters")
     config = data.draw(objects(cls))
     file = yaml.safe_dump({"/**": {"ros__parameters": parameters.to_parameters(config.to_dict(), cls)}})
     read = yaml.safe_load(file)["/**"]["ros__parameters"]

@@ -23,7 +23,7 @@ def check_on_air(config: ChannelConfig, frames: list[tuple[int, int, int]], flip
     starts = sorted(frames, key=lambda f: f[1])
     for number, (sender, start, length) in enumerate(starts):
         line.begin((number, sender), sender, start, length)
-    for number, v in enumerate(sorted(line.settle(100 * MS), key=lambda v: v.frame_id)):
+    for number, v in enumerate(sorted(line.resolve(100 * MS), key=lambda v: v.frame_id)):
         received = v.received.copy()
         if flip and number == flip[0] % len(frames):
             received[flip[1]] ^= True
@@ -43,7 +43,7 @@ def test_frames_that_wait_for_a_line_begin_and_arrive_when_the_channel_says(fram
     starts = sorted(frames, key=lambda f: f[1])
     for number, (sender, start, length) in enumerate(starts):
         line.begin((number, sender), sender, start, length)
-    verdicts = list(line.settle(100 * MS))
+    verdicts = list(line.resolve(100 * MS))
     for v in verdicts:
         _, start, length = starts[v.frame_id[0]]
         sent.add(*v.frame_id, start, bytes(length), v.received, v.lost, v.collided)

@@ -10,7 +10,7 @@ import air_helpers as helpers
 import numpy as np
 import pytest
 
-from dtsa_agent.air.udp import UdpSettings
+from dtsa_agent.air.settings import UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.experiments.sweep import make_sweep

@@ -17,9 +17,9 @@ from waiting import wait_for
 
 pytest.importorskip("usb")
 
-from dtsa_agent.air.crazyradio import CrazyradioSettings
-from dtsa_agent.air.crazyradio.packets import broadcast, datagram_in
-from dtsa_agent.air.datagram import link_of
+from dtsa_agent.air.crazyradio_dongle import broadcast, datagram_in
+from dtsa_agent.air.port import link_of
+from dtsa_agent.air.settings import CrazyradioSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.station import StationSettings
 from dtsa_agent.keys import authenticator

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.air.datagram import NETWORK
+from dtsa_agent.air.port import NETWORK
 from dtsa_agent.air.record import SlotRecord
-from dtsa_agent.air.udp import UdpSettings
+from dtsa_agent.air.settings import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import AgentBag, NothingWritten, read

@@ -9,7 +9,7 @@ import air_helpers as helpers
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.air.udp import UdpSettings
+from dtsa_agent.air.settings import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.log.agent_bag import read
 from dtsa_bench.log.merge.merge import Merge, verified

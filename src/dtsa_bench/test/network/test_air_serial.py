@@ -16,9 +16,8 @@ import serial
 from dtsa_dev.network.fake_modems import FakeModems, FakeModemSettings
 from waiting import wait_for
 
-from dtsa_agent.air.serial import SerialSettings
-from dtsa_agent.air.serial.frames import to_line
-from dtsa_agent.air.serial.port import SerialPort
+from dtsa_agent.air.serial_port import SerialPort, to_line
+from dtsa_agent.air.settings import SerialSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import read
@@ -203,7 +202,7 @@ def test_bytes_of_mavlink_are_told_and_the_bag_is_whole(tmp_path: Path) -> None:
             time.sleep(0.005)
         wait_for(lambda: any("MAVLink" in line for line in one.said))
         made.inject(1, to_line(b"a stranger's"))
-        wait_for(lambda: one.agent.tally.refused.total() > 0)
+        wait_for(lambda: one.agent.counts.refused.total() > 0)
         helpers.go_on([one], 10)
     bag = read(tmp_path / "cf1.mcap")
     assert not bag.broken_off

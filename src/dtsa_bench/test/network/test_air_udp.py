@@ -20,8 +20,8 @@ from rosbags.rosbag2 import Reader
 from waiting import wait_for
 
 import dtsa
-from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import UdpPort, UdpSettings
+from dtsa_agent.air.settings import AgentSettings, UdpSettings
+from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.commands.cli import main
@@ -81,7 +81,7 @@ def _disturb(stranger: UdpPort, flying: list[helpers.Flying]) -> None:
 
     def repeats() -> bool:
         stranger.send(helpers.hear(stranger, 1)[-1])
-        return all(one.agent.tally.refused["repeated"] for one in flying)
+        return all(one.agent.counts.refused["repeated"] for one in flying)
 
     wait_for(repeats)
     kept = helpers.hear(stranger, 6)  # of two at least: to its sender an old datagram is a repeated one

@@ -12,8 +12,8 @@ import air_helpers as helpers
 import numpy as np
 import pytest
 
-from dtsa_agent.air.datagram import NETWORK, link_of
-from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.port import NETWORK, link_of
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.station import StationSettings
 from dtsa_bench.network.check import Check, lasts_s, table
@@ -23,16 +23,16 @@ MS, SLOT = 1_000_000, CONFIG.slot_ns
 NONE = np.zeros(3)
 
 
-def record(slot: int, chosen: int, heard: list[Heard], anew: bool = False) -> SlotRecord:
+def record(slot: int, chosen: int, heard: list[ReceivedFrame], is_first: bool = False) -> SlotRecord:
     start, track = slot * SLOT, np.zeros((1, 3))
-    return SlotRecord(slot, start, start, anew, 1, chosen, 0, 0, 0.0, track, NONE, NONE, NONE, heard=heard)
+    return SlotRecord(slot, start, start, is_first, 1, chosen, 0, 0, 0.0, track, NONE, NONE, NONE, heard=heard)
 
 
-def said(sender: int, slot: int, delay_ns: int, hears: Sequence[int]) -> Heard:
+def said(sender: int, slot: int, delay_ns: int, hears: Sequence[int]) -> ReceivedFrame:
     """A frame that arrives so long after its slot has started; its sender names whom it hears."""
     frame = encode_frame(Frame(sender, slot, 1, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0)))
     data = StationSettings(CONFIG, link_of(CONFIG)).write(frame, slot, 0, tuple((k, 0) for k in hears))
-    return Heard(sender, slot, slot * SLOT + delay_ns, data, accepted=True)
+    return ReceivedFrame(sender, slot, slot * SLOT + delay_ns, data, accepted=True)
 
 
 def checked(delay_ns: dict[int, int], hears: dict[int, Sequence[int]], silent: Sequence[int] = ()) -> Check:
@@ -42,7 +42,7 @@ def checked(delay_ns: dict[int, int], hears: dict[int, Sequence[int]], silent: S
         sender = slot % 4 + 1
         there = sender in delay_ns and slot not in silent
         heard = [said(sender, slot, delay_ns[sender], hears[sender])] if there else []
-        check.slot(record(slot, sender, heard, anew=slot == 100))
+        check.slot(record(slot, sender, heard, is_first=slot == 100))
     return check
 
 
@@ -83,7 +83,7 @@ def test_it_lasts_until_all_can_tell_and_one_that_is_too_short_says_so() -> None
     for slot in range(100, 112):
         sender = slot % 4 + 1
         heard = [said(sender, slot, MS, ALL[sender])] if sender > 1 else []
-        check.slot(record(slot, sender, heard, anew=slot == 100))
+        check.slot(record(slot, sender, heard, is_first=slot == 100))
     assert [line.split(":")[1] for line in check.result()["missing"]] == [" check for longer"] * 3
     lease = SwarmConfig(agents=6, policy="lease", slot_ms=150.0)
     assert lasts_s(lease) == pytest.approx((3 * 3 + 2 * 15 + 20) * 6 * 0.15)

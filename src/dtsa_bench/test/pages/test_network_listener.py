@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.datagram import link_of
+from dtsa_agent.air.port import link_of
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.station import ParsedDatagram, StationSettings
 from dtsa_bench.pages.view.history import MAX_MOMENTS, RunHistory

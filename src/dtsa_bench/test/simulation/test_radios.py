@@ -50,7 +50,7 @@ def sends(range_m: float, *at_ns: int) -> tuple[list[int], dict[int, int]]:
             now_ns, agent = released
             begun.append(now_ns)
             air.begin(agent, agent, now_ns, LENGTH)
-    return begun, {verdict.sender: verdict.collided for verdict in air.settle(20 * MS, places)}
+    return begun, {verdict.sender: verdict.collided for verdict in air.resolve(20 * MS, places)}
 
 
 def test_who_hears_another_one_waits_and_hidden_or_turning_senders_collide() -> None:

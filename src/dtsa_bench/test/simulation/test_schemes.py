@@ -18,7 +18,7 @@ from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.plugins.kinds import Table
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings import StationSettings, SwarmSettings
-from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.stop import Stop
 from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
 from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.flights.flight import FlightOptions, check_options

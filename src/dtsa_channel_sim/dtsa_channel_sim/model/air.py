@@ -1,7 +1,7 @@
-"""The air: transmissions that begin at any instant, on one time line, settled by overlap.
+"""The air: transmissions that begin at any instant, on one time line, resolved by overlap.
 
 Pure code: the caller says how far time has come. Transmissions may be handed in out of order, as they come from
-several processes, as long as each arrives before the time line is settled past its start.
+several processes, as long as each arrives before the time line is resolved past its start.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Air(Generic[Key]):
 
     __slots__ = (
         "_airtime", "_asked", "_by_end", "_by_start", "_channel", "_count", "_ids", "_lines", "_longest_ns",
-        "_near", "_settled", "_settled_ns", "late",
+        "_near", "_resolved", "_resolved_ns", "late",
     )  # fmt: skip
 
     def __init__(self, channel: Media) -> None:
@@ -129,24 +129,24 @@ class Air(Generic[Key]):
         self._longest_ns = airtime.total_ns(airtime.longest)
         self._lines = Lines(airtime, channel.config.agents) if airtime.line.serial else None
         self._asked: list[tuple[int, int, int, int, Key]] = []  # with lines, what no radio has begun to send: a heap
-        self._settled: list[FrameVerdict[Key]] = []  # verdicts that have not been asked for yet
+        self._resolved: list[FrameVerdict[Key]] = []  # verdicts that were not returned yet
         self._count = 0  # makes entries of the heaps differ: keys need no order
-        self._by_end: list[tuple[int, int, int, int, OnAir, int, Key]] = []  # not settled yet: a heap
-        self._by_start: list[tuple[int, int, OnAir]] = []  # not near the time that is settled yet: a heap
-        self._near: list[OnAir] = []  # settled or not, what may overlap the next frame that is settled
+        self._by_end: list[tuple[int, int, int, int, OnAir, int, Key]] = []  # not resolved yet: a heap
+        self._by_start: list[tuple[int, int, OnAir]] = []  # not near the time that is resolved yet: a heap
+        self._near: list[OnAir] = []  # what may overlap the next frame that is resolved
         self._ids: set[Key] = set()
-        self._settled_ns = -(2**63)
-        #: Frames handed in after the time line had been settled past their start: they are dropped.
+        self._resolved_ns = -(2**63)
+        #: Frames handed in after the time line had been resolved past their start: they are dropped.
         self.late = 0
 
     @property
     def pending(self) -> int:
         """Number of frames that have no verdict yet."""
-        return len(self._by_end) + len(self._asked) + len(self._settled)
+        return len(self._by_end) + len(self._asked) + len(self._resolved)
 
     @property
     def due_ns(self) -> int:
-        """Until when to settle next, ns: before that nothing begins or ends that has been handed in."""
+        """Until when to resolve next, ns: before that nothing begins or ends that has been handed in."""
         end_ns = self._by_end[0][0] if self._by_end else NEVER
         return min(end_ns, self._asked[0][0] + 1 if self._asked else NEVER)
 
@@ -165,13 +165,13 @@ class Air(Generic[Key]):
             raise LocalProtocolError(f"length {length}: a frame has 1 to {longest} bytes")
         if frame_id in self._ids:
             raise LocalProtocolError(f"frame {frame_id!r} is pending already")
-        if start_ns < self._settled_ns:
+        if start_ns < self._resolved_ns:
             self.late += 1
             return False
         self._ids.add(frame_id)
         self._count += 1
         if self._lines is None:
-            self._lay(sender, start_ns, self._count, length, frame_id)
+            self._schedule(sender, start_ns, self._count, length, frame_id)
         else:
             heappush(self._asked, (start_ns, sender, self._count, length, frame_id))
         return True
@@ -181,25 +181,25 @@ class Air(Generic[Key]):
 
         A transmission that is still turning to sending is not sensed yet: two that begin within that time collide.
 
-        :raises LocalProtocolError: for a time that has been settled already.
+        :raises LocalProtocolError: for a time that has been resolved already.
         """
-        if when_ns < self._settled_ns:
-            raise LocalProtocolError(f"the air at {when_ns} ns: settled until {self._settled_ns} ns already")
+        if when_ns < self._resolved_ns:
+            raise LocalProtocolError(f"the air at {when_ns} ns: resolved until {self._resolved_ns} ns already")
         if self._lines is not None:
             self._run(when_ns, when_ns + 1, positions)
         self._approach(when_ns + 1)
         medium = self._channel.medium(self._slot(when_ns))
         return any(medium.senses(receiver, when_ns, frame, positions) for frame in self._near)
 
-    def settle(self, until_ns: int, positions: Positions | None = None) -> list[FrameVerdict[Key]]:
+    def resolve(self, until_ns: int, positions: Positions | None = None) -> list[FrameVerdict[Key]]:
         """Return the verdicts on all frames that have left the air by a time, in the order of their ends.
 
         Every frame that starts before it has been handed in. The result does not depend on the order in which frames
         were handed in, nor on how often this is called.
         """
-        self._settled_ns = max(self._settled_ns, until_ns)
+        self._resolved_ns = max(self._resolved_ns, until_ns)
         self._run(until_ns, until_ns, positions)
-        verdicts, self._settled = self._settled, []
+        verdicts, self._resolved = self._resolved, []
         if verdicts:
             self._channel.advance(until_ns // self._channel.config.slot_ns)
         return verdicts
@@ -215,18 +215,18 @@ class Air(Generic[Key]):
                 at_ns, sender, count, length, frame_id = heappop(asked)
                 assert self._lines is not None
                 start_ns = self._lines.start_ns(sender, at_ns, length)
-                self._lay(sender, start_ns, count, length, frame_id)
+                self._schedule(sender, start_ns, count, length, frame_id)
             elif end_ns <= until_ns:
                 *_, frame, length, frame_id = heappop(by_end)
                 self._ids.discard(frame_id)
                 self._approach(frame.end_ns)
-                self._settled.append(self._verdict(frame, length, frame_id, positions))
-                # What is settled later ends later, so it starts at most one longest frame before this end.
+                self._resolved.append(self._verdict(frame, length, frame_id, positions))
+                # What is resolved later ends later, so it starts at most one longest frame before this end.
                 self._forget(frame.end_ns - self._longest_ns)
             else:
                 return
 
-    def _lay(self, sender: int, start_ns: int, count: int, length: int, frame_id: Key) -> None:
+    def _schedule(self, sender: int, start_ns: int, count: int, length: int, frame_id: Key) -> None:
         """Put a transmission on the time line."""
         frame = OnAir.of(self._airtime, sender, start_ns, length)
         heappush(self._by_end, (frame.end_ns, start_ns, sender, count, frame, length, frame_id))
@@ -236,7 +236,7 @@ class Air(Generic[Key]):
         return max(0, time_ns // self._channel.config.slot_ns)
 
     def _approach(self, before_ns: int) -> None:
-        """Take a look at all transmissions that start before a time."""
+        """Move all transmissions that start before a time to those that may overlap."""
         while self._by_start and self._by_start[0][0] < before_ns:
             self._near.append(heappop(self._by_start)[2])
 
@@ -248,7 +248,7 @@ class Air(Generic[Key]):
         """Return the verdict on a transmission that all are known to that may overlap it."""
         slot = self._slot(frame.start_ns)
         others = [o for o in self._near if o is not frame and o.start_ns < frame.end_ns and o.end_ns > frame.start_ns]
-        received, lost, collided = self._channel.medium(slot).judge(slot, frame, others, positions)
+        received, lost, collided = self._channel.medium(slot).resolve(slot, frame, others, positions)
         arrival_ns = frame.end_ns + self._airtime.from_radio_ns(length)
         if self._lines is not None:
             reached = int(np.count_nonzero(received))

@@ -9,8 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from dtsa_agent.air.serial.lengths import FRAMING
-from dtsa_agent.air.serial.modems import MODEMS, NONE, Modem
+from dtsa_agent.air.serial_modems import FRAMING, MODEMS, NONE, Modem
 
 #: Bits around the data: preamble, address, length and control fields, checksum.
 OVERHEAD_BITS = 73

@@ -75,12 +75,9 @@ class Channel:
         self._last = max(self._last, slot)
 
     def arbitrate(
-        self,
-        slot: int,
-        senders: Sequence[int],
-        lengths: Sequence[int] | None = None,
+        self, slot: int, senders: Sequence[int], lengths: Sequence[int] | None = None,
         positions: Positions | None = None,
-    ) -> Verdict:
+    ) -> Verdict:  # fmt: skip
         """Return who received what in one slot.
 
         :param slot: number of the slot, 0 or more; usually one after the other.
@@ -98,10 +95,10 @@ class Channel:
             if len(senders) == 1:
                 alone = self._alone.get(senders[0])
                 if alone is not None:
-                    return alone if self._plain else self._one(slot, senders[0], alone)
+                    return alone if self._plain else self._arbitrate_one(slot, senders[0], alone)
             elif not len(senders):
                 return self._idle
-        return self._many(slot, slot > last, self._checked(senders), lengths, positions)
+        return self._arbitrate_many(slot, slot > last, self._check_senders(senders), lengths, positions)
 
     def medium(self, slot: int) -> Medium:
         """Return the medium of a slot, with the settings that hold in it."""
@@ -133,7 +130,7 @@ class Channel:
         self._simple = self._shared and not epoch.config.jam
         self._plain = self._simple and self._losses.none
 
-    def _one(self, slot: int, sender: int, alone: Verdict) -> Verdict:
+    def _arbitrate_one(self, slot: int, sender: int, alone: Verdict) -> Verdict:
         """Return the verdict on the only frame of a slot, everybody in reach."""
         lost = self._losses.lost(slot, sender)
         received = ~lost
@@ -143,14 +140,10 @@ class Channel:
             return alone
         return Verdict(SUCCESS, alone.senders, received, (missing,), (0,))
 
-    def _many(
-        self,
-        slot: int,
-        follows: bool,
-        senders: tuple[int, ...],
-        lengths: Sequence[int] | None,
+    def _arbitrate_many(
+        self, slot: int, follows: bool, senders: tuple[int, ...], lengths: Sequence[int] | None,
         positions: Positions | None,
-    ) -> Verdict:
+    ) -> Verdict:  # fmt: skip
         """Return the verdict on any number of frames, in full generality."""
         if not follows:
             self._near = []
@@ -158,18 +151,18 @@ class Channel:
         if self._shared and not self._near and len(senders) > 1:
             others = (agents - 1,) * len(senders)
             return Verdict(COLLISION, senders, np.zeros((len(senders), agents), np.bool_), (0,) * len(senders), others)
-        on_air = [*self._near, *self._sent(slot, senders, lengths)]
+        on_air = [*self._near, *self._transmissions(slot, senders, lengths)]
         first, end_ns = len(self._near), (slot + 1) * self.config.slot_ns
         self._near = [frame for frame in on_air if frame.end_ns > end_ns]
         if not senders:
             return self._idle
         receptions = [
-            self._medium.judge(slot, on_air[k], on_air[:k] + on_air[k + 1 :], positions)
+            self._medium.resolve(slot, on_air[k], on_air[:k] + on_air[k + 1 :], positions)
             for k in range(first, len(on_air))
         ]
         return Verdict.of(senders, receptions)
 
-    def _sent(self, slot: int, senders: tuple[int, ...], lengths: Sequence[int] | None) -> list[OnAir]:
+    def _transmissions(self, slot: int, senders: tuple[int, ...], lengths: Sequence[int] | None) -> list[OnAir]:
         """Return the transmissions of a slot: all start with it."""
         start = slot * self.config.slot_ns
         if lengths is None:
@@ -180,7 +173,7 @@ class Channel:
             OnAir.of(self._airtime, sender, start, int(length)) for sender, length in zip(senders, lengths, strict=True)
         ]
 
-    def _checked(self, senders: Sequence[int]) -> tuple[int, ...]:
+    def _check_senders(self, senders: Sequence[int]) -> tuple[int, ...]:
         ids = tuple(int(sender) for sender in senders)
         for sender in ids:
             if sender not in self._alone:

@@ -41,77 +41,52 @@ class ChannelConfig(Settings):
     slot_ns: int = setting(10_000_000, "length of a slot", unit="ns", minimum=1, maximum=10**12)
     seed: int = setting(0, "seed of all losses", minimum=0, maximum=2**63 - 1)
     loss: float = setting(
-        0.0,
-        "mean share of frames that a receiver loses, each receiver for itself",
-        minimum=0.0,
-        maximum=1.0,
+        0.0, "mean share of frames that a receiver loses, each receiver for itself", minimum=0.0, maximum=1.0,
         changeable=True,
-    )
+    )  # fmt: skip
     burst_length: float = setting(
-        0.0,
-        "mean length of a bad phase (Gilbert-Elliott); 0: every loss is independent",
-        unit="slots",
-        minimum=0.0,
-        maximum=1e9,
-        changeable=True,
-    )
+        0.0, "mean length of a bad phase (Gilbert-Elliott); 0: every loss is independent", unit="slots", minimum=0.0,
+        maximum=1e9, changeable=True,
+    )  # fmt: skip
     burst_scope: str = setting(
-        "receiver",
-        "what has bad phases: a receiver (it loses all senders) or each directed link",
+        "receiver", "what has bad phases: a receiver (it loses all senders) or each directed link",
         choices=("receiver", "link"),
-    )
+    )  # fmt: skip
     p_good: float = setting(0.0, "loss within a good phase", minimum=0.0, maximum=1.0, changeable=True)
     p_bad: float = setting(1.0, "loss within a bad phase", minimum=0.0, maximum=1.0, changeable=True)
     losses: MeasuredLosses | str = setting(
-        "",
-        "file of losses that were measured, on top of all others: what `losses` has written",
-        kind="file",
+        "", "file of losses that were measured, on top of all others: what `losses` has written", kind="file",
         custom=True,
-    )
+    )  # fmt: skip
     jam: bool = setting(False, "all frames are lost", changeable=True)
     partition: Groups | str = setting(
-        "",
-        "groups that do not hear each other: [[1, 2, 3], [4, 5]]; empty: all together",
-        kind="text",
-        changeable=True,
-        custom=True,
-    )
+        "", "groups that do not hear each other: [[1, 2, 3], [4, 5]]; empty: all together", kind="text",
+        changeable=True, custom=True,
+    )  # fmt: skip
     range_m: float = setting(
-        0.0,
-        "distance up to which a frame is received; 0: everywhere",
-        unit="m",
-        minimum=0.0,
-        maximum=1e6,
-        changeable=True,
-        group="Reach and radio",
-    )
+        0.0, "distance up to which a frame is received; 0: everywhere", unit="m", minimum=0.0, maximum=1e6,
+        changeable=True, group="Reach and radio",
+    )  # fmt: skip
     interference_factor: float = setting(
         1.0, "a frame disturbs others up to this many times range_m", minimum=1.0, maximum=100.0
     )
     capture_db: float = setting(
-        0.0,
-        "a frame this much stronger than all that overlap it is received; 0: no capture",
-        unit="dB",
-        minimum=0.0,
-        maximum=100.0,
-    )
+        0.0, "a frame this much stronger than all that overlap it is received; 0: no capture", unit="dB",
+        minimum=0.0, maximum=100.0,
+    )  # fmt: skip
     path_loss_exponent: float = setting(
         2.0, "power falls with this power of the distance (capture)", minimum=1.0, maximum=6.0
     )
     radio: str = setting(
-        "plain",
-        "what carries frames: plain, or a radio whose line to the flight processor takes its time",
+        "plain", "what carries frames: plain, or a radio whose line to the flight processor takes its time",
         choices=tuple(RADIOS),
-    )
+    )  # fmt: skip
     bitrate: int = setting(2_000_000, "bits on air per second", unit="bit/s", minimum=1000, maximum=10**9)
     ramp_up_ns: int = setting(130_000, "from the order to send to the first bit", unit="ns", minimum=0, maximum=10**9)
     link_delay_ns: int = setting(
-        300_000,
-        "between radio and flight processor, each way, with radio plain (arrival times in real time)",
-        unit="ns",
-        minimum=0,
-        maximum=10**9,
-    )
+        300_000, "between radio and flight processor, each way, with radio plain (arrival times in real time)",
+        unit="ns", minimum=0, maximum=10**9,
+    )  # fmt: skip
     loss_matrix: Matrix = setting((), "loss of each link on top of loss: row = sender, column = receiver")
     link_loss: tuple[LinkLoss, ...] = setting((), "loss of some links, laid over loss_matrix", changeable=True)
     schedule: tuple[Change, ...] = setting((), "changes at known slots")

@@ -56,9 +56,7 @@ class GilbertElliott:
         shortest = 1.0 / (1.0 - share)
         if burst_length < shortest * (1.0 - 1e-12):
             raise ConfigError(
-                "burst_length",
-                burst_length,
-                f"at a loss of {loss:g} at least {shortest:.4g} slots, or 0 for none",
+                "burst_length", burst_length, f"at a loss of {loss:g} at least {shortest:.4g} slots, or 0 for none"
             )
         leave = 1.0 / burst_length
         return cls(share, leave * share / (1.0 - share), leave)
@@ -116,7 +114,7 @@ class Chains:
             return before
         if floor > slot or before is None:
             floor, before = -1, None
-        bad = self._look_back(slot, self._factors[sender], self._limits[sender], floor, before)[None]
+        bad = self._search_back(slot, self._factors[sender], self._limits[sender], floor, before)[None]
         bad.setflags(write=False)
         self._known[sender] = (slot, bad)
         return bad
@@ -136,10 +134,10 @@ class Chains:
         phase = np.zeros(shape, dtype=np.uint8)
         for row, sender in enumerate(senders if slot >= 0 else ()):
             factor = self._factors[sender] if sender else np.uint64(1)
-            phase[row] = self._look_back(slot, factor, limits[row], -1, None)
+            phase[row] = self._search_back(slot, factor, limits[row], -1, None)
         return {**arrays, "phase": phase}
 
-    def _look_back(self, slot: int, factor: np.uint64, limits: _Limits, floor: int, before: Mask | None) -> Mask:
+    def _search_back(self, slot: int, factor: np.uint64, limits: _Limits, floor: int, before: Mask | None) -> Mask:
         """Return the states (N,) in a slot, from the last word that decided, or ``before`` in ``floor``."""
         agents = self._words.agents
         bad = np.zeros(agents, dtype=np.bool_) if before is None else before[0].copy()
@@ -179,7 +177,7 @@ class Chains:
             if first == self._end:
                 before = self._block[-1]
             else:
-                before = self._look_back(first - 1, np.uint64(1), limits, -1, None)
+                before = self._search_back(first - 1, np.uint64(1), limits, -1, None)
             bad[0] = np.where(decided[0], bad[0], before)
             decided[0] = True
         last = np.where(decided, np.arange(len(bad))[:, None], 0)

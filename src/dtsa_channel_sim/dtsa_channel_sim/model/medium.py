@@ -82,7 +82,9 @@ class Medium:
         #: everywhere.
         self.everywhere = not self.needs_positions and self._groups is None
 
-    def judge(self, slot: int, frame: OnAir, others: Sequence[OnAir], positions: Positions | None = None) -> Reception:
+    def resolve(
+        self, slot: int, frame: OnAir, others: Sequence[OnAir], positions: Positions | None = None
+    ) -> Reception:
         """Return what became of one transmission among others that may overlap it, by the random numbers of a slot.
 
         :raises LocalProtocolError: when positions are needed and missing.
@@ -98,7 +100,7 @@ class Medium:
 
     def reach(self, sender: int, positions: Positions | None = None) -> Mask:
         """Return who hears an agent alone on the air but for noise, (N,)."""
-        return self._heard(sender, positions, self._range2)[0]
+        return self._strength_of(sender, positions, self._range2)[0]
 
     def senses(self, receiver: int, when_ns: int, frame: OnAir, positions: Positions | None = None) -> bool:
         """Return whether a radio that listens finds the air busy with a transmission.
@@ -109,11 +111,11 @@ class Medium:
             return frame.start_ns <= when_ns < frame.end_ns
         if not frame.air_ns <= when_ns < frame.end_ns:
             return False
-        return self.everywhere or bool(self._heard(frame.sender, positions, self._disturb2)[0][receiver - 1])
+        return self.everywhere or bool(self._strength_of(frame.sender, positions, self._disturb2)[0][receiver - 1])
 
     def _undisturbed(self, frame: OnAir, others: Sequence[OnAir], positions: Positions | None) -> tuple[Mask, int]:
         """Return who hears a transmission but for noise, (N,), and how many in its reach do not."""
-        reach, power = self._heard(frame.sender, positions, self._range2)
+        reach, power = self._strength_of(frame.sender, positions, self._range2)
         if not others:
             return reach, 0
         disturbed = np.zeros(self._agents, dtype=np.bool_)
@@ -123,7 +125,7 @@ class Medium:
             if other.deafens(frame):
                 deaf.append(other.sender - 1)
             if other.overlaps(frame):
-                heard, strength = self._heard(other.sender, positions, self._disturb2)
+                heard, strength = self._strength_of(other.sender, positions, self._disturb2)
                 disturbed |= heard
                 if self._capture:
                     noise += np.where(heard, strength, 0.0)
@@ -134,7 +136,7 @@ class Medium:
         collided = reach & disturbed
         return reach & ~collided, int(np.count_nonzero(collided))
 
-    def _heard(self, sender: int, positions: Positions | None, range2: float) -> tuple[Mask, NDArray[np.float64]]:
+    def _strength_of(self, sender: int, positions: Positions | None, range2: float) -> tuple[Mask, NDArray[np.float64]]:
         """Return who is near enough to a sender, (N,), and the power there, relative to that at 1 m (with capture)."""
         heard = np.ones(self._agents, dtype=np.bool_)
         power = _NO_POWER

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import isnan
 from operator import attrgetter
@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.wire.checks import FARTHEST_M, RANGE, SIZES, SLOT, Unusable, check_frames, check_ids
-from dtsa_agent.ros.common.wire.messages import TRANSMISSION, Fields
-from dtsa_agent.ros.common.wire.packing import split_frames
+from dtsa_agent.ros.common.cdr import split_frames
+from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, SLOT, BadMessage, check_frames, check_ids
+from dtsa_agent.ros.common.messages import TRANSMISSION, Fields
+from dtsa_agent.ros.common.names import agent_names
 
 Array = NDArray[np.float64]
 Places = slice | NDArray[np.intp]
@@ -28,7 +28,7 @@ _FARTHEST_OFF_NS = 60_000_000_000  # no agent's slot is farther from the channel
 
 
 @dataclass(slots=True)
-class TakenIn:
+class FrameReceipt:
     """A frame that agents received during a slot, in real time."""
 
     slot: int  # as its sender counts
@@ -62,7 +62,7 @@ class Answers:
         self.command = self._motion[-6:-3]  # m/s, now
         self.goal = self._motion[-3:]  # m
         self.offset_ns = np.zeros(agents, dtype=np.int64)  # real time: of slot or transmission
-        self.taken_in: list[TakenIn] | None = None  # real time: what the agents report to have received in the slot
+        self.receipts: list[FrameReceipt] | None = None  # real time: what agents report to have received
         self._goal_known = np.zeros(agents, dtype=np.bool_)
         self._places: dict[bytes, Places] = {}
         self._lengths: dict[int, tuple[int, ...]] = {}  # of the fields of answers that fit, by number of agents
@@ -86,7 +86,7 @@ class Answers:
     def add(self, message: Fields) -> bool:
         """Add one transmission message; return False if its agents have answered already: nothing is changed then.
 
-        :raises Unusable: if its fields do not fit together, naming the agents as far as it does.
+        :raises BadMessage: if its fields do not fit together, naming the agents as far as it does.
         """
         at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
         if self.answered[at].any():
@@ -121,15 +121,13 @@ class Answers:
         self.missing -= count
         return True
 
-    def put(self, at: Places, count: int, offset_ns: Any, motion: Sequence[Array], **decided: Any) -> None:
-        """Add a report of real time, checked: start of slots or transmissions, motion, decision.
-
-        Motion is track (m), velocity, command (m/s) and goal (m), as in a report.
-        """
+    def add_report(self, at: Places, message: Fields, row: int) -> None:
+        """Add what some agents report for one slot, a row of a report; checked before."""
+        count, rows = len(message.agent), len(message.slot)
+        motion = [getattr(message, name).reshape(rows, -1)[row] for name in _MOTION]
         self._motion[:, at] = np.concatenate(motion).reshape(-1, count)
-        for name, values in decided.items():
-            getattr(self, name)[at] = values
-        self.offset_ns[at] = offset_ns
+        for name in (*_DECIDED, "offset_ns"):
+            getattr(self, name)[at] = getattr(message, name)[row * count : (row + 1) * count]
         self._goal_known[at] = self.answered[at] = True
         self.missing -= count
 
@@ -147,7 +145,7 @@ class Answers:
 def places_of(ids: Any, agents: int, known: dict[bytes, Places]) -> Places:
     """Return the indices of a message's agents, a slice where they are consecutive; ``known`` keeps them.
 
-    :raises Unusable: for ids that do not ascend from 1 to N.
+    :raises BadMessage: for ids that do not ascend from 1 to N.
     """
     key = ids.tobytes()
     places = known.get(key)
@@ -185,11 +183,11 @@ _ITEM_BYTES = {
 }
 
 
-def _unusable(reason: str, message: Fields, detail: str, what: str = "an unusable answer") -> Unusable:
-    return Unusable(reason, f"{named(message.agent)} sent {what}: {detail}")
+def _unusable(reason: str, message: Fields, detail: str, what: str = "an unusable answer") -> BadMessage:
+    return BadMessage(reason, f"{agent_names(message.agent)} sent {what}: {detail}")
 
 
-class Delivered(NamedTuple):
+class DeliveredFrame(NamedTuple):
     """A frame that was sent to its receivers."""
 
     data: bytes
@@ -208,8 +206,8 @@ class Accounts:
         self.missed = 0  # entries of reports that came too late to count
         self._open: dict[int, Answers] = {}
         self._closed = -1
-        self._delivered: dict[tuple[int, int], Delivered] = {}  # by slot and sender
-        self._taken_in: dict[int, dict[tuple[int, int], TakenIn]] = {}
+        self._delivered: dict[tuple[int, int], DeliveredFrame] = {}  # by slot and sender
+        self._receipts: dict[int, dict[tuple[int, int], FrameReceipt]] = {}  # by slot here; slot and sender
         self._places: dict[bytes, Places] = {}
 
     def __getitem__(self, slot: int) -> Answers:
@@ -229,65 +227,62 @@ class Accounts:
         reported = [slot for slot, book in self._open.items() if book.answered[agent - 1]]
         return self._open[max(reported)].position[:, agent - 1] if reported else None
 
-    def deliver(self, slot: int, sender: int, delivered: Delivered) -> None:
+    def deliver(self, slot: int, sender: int, delivered: DeliveredFrame) -> None:
         """A frame has been sent to its receivers."""
         self._delivered[slot, sender] = delivered
 
     def add(self, message: Fields, latest: int) -> int:
         """Add a report; return its last slot that is still open, -1: none. No slot after ``latest`` can have begun.
 
-        :raises Unusable: if its fields do not fit together.
+        :raises BadMessage: if its fields do not fit together.
         """
         at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
         _check_report(message, self._steps)
         slots = message.slot.tolist()
         last = max(slots[-1] if slots else 0, max(message.heard_in.tolist(), default=0))
         if last > latest:
-            raise Unusable(SLOT, f"{named(message.agent)} reported slot {last}, which has not begun")
-        motion = [getattr(message, name).reshape(len(slots), -1) for name in _MOTION] if slots else []
+            raise BadMessage(SLOT, f"{agent_names(message.agent)} reported slot {last}, which has not begun")
         newest = -1
         for row, slot in enumerate(slots):
             if slot <= self._closed:
                 self.missed += count
                 continue
             book = self[slot]
-            if book.answered[at].any():
-                continue  # reported twice
-            part = slice(row * count, (row + 1) * count)
-            decided = {name: getattr(message, name)[part] for name in _DECIDED}
-            book.put(at, count, message.offset_ns[part], [planes[row] for planes in motion], **decided)
-            newest = slot
-        if len(message.heard_sender):
-            self._add_received(message, at, count)
-        return newest
-
-    def _add_received(self, message: Fields, at: Places, count: int) -> None:
-        """Add the frames that agents received, by the slot here; what was not delivered to them is left out."""
-        rows = message.heard_by.reshape(-1, -(-count // 8))
-        masks = np.unpackbits(rows, axis=1, count=count, bitorder="little").astype(np.bool_)
-        columns = (message.heard_slot, message.heard_sender, message.heard_in, message.heard_ns)
-        for slot, sender, here, at_ns, mask in zip(*(column.tolist() for column in columns), masks, strict=True):
+            if not book.answered[at].any():  # else reported twice
+                book.add_report(at, message, row)
+                newest = slot
+        for slot, sender, here, at_ns, mask in received_in(message):
             delivered = self._delivered.get((slot, sender))
-            if delivered is None:
+            if delivered is None:  # it was not sent to any receiver
                 continue
-            entries = self._taken_in.setdefault(max(here, self._closed + 1), {})
-            taken = entries.get((slot, sender))
-            if taken is None:
+            receipts = self._receipts.setdefault(max(here, self._closed + 1), {})
+            if (slot, sender) not in receipts:
                 never = np.full(self.agents, -1, dtype=np.int64)
-                taken = entries[slot, sender] = TakenIn(slot, sender, delivered.data, delivered.arrival_ns, never)
-            taken.at_ns[at] = np.where(mask & delivered.received[at], max(0, at_ns), taken.at_ns[at])
+                receipts[slot, sender] = FrameReceipt(slot, sender, delivered.data, delivered.arrival_ns, never)
+            times = receipts[slot, sender].at_ns
+            times[at] = np.where(mask & delivered.received[at], max(0, at_ns), times[at])
+        return newest
 
     def close(self, slot: int) -> None:
         """A slot is over: its account and what is too old is forgotten."""
         self._closed = slot
         self._open.pop(slot, None)
-        self._taken_in.pop(slot, None)
+        self._receipts.pop(slot, None)
         while self._delivered and (oldest := next(iter(self._delivered)))[0] < slot - self._keep:
             del self._delivered[oldest]
 
-    def taken_in(self, slot: int) -> list[TakenIn]:
+    def receipts(self, slot: int) -> list[FrameReceipt]:
         """Return the frames that agents received during a slot, as far as they have reported."""
-        return list(self._taken_in.get(slot, {}).values())
+        return list(self._receipts.get(slot, {}).values())
+
+
+def received_in(message: Fields) -> Iterator[tuple[int, int, int, int, NDArray[np.bool_]]]:
+    """Give the frames that the agents of a report received: slot, sender, slot here, ns, and by which of them."""
+    count = len(message.agent)
+    rows = message.heard_by.reshape(-1, -(-count // 8))
+    masks = np.unpackbits(rows, axis=1, count=count, bitorder="little").astype(np.bool_)
+    columns = (message.heard_slot, message.heard_sender, message.heard_in, message.heard_ns)
+    return zip(*(column.tolist() for column in columns), masks, strict=True)
 
 
 def _check_report(message: Fields, steps: int) -> None:

@@ -18,11 +18,11 @@ from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import setting, settings_of
-from dtsa_agent.ros.common.graph.names import MODES
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, from_parameter, swarm_wide_node
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import ending, run_node
-from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
+from dtsa_agent.priority import PrioritySettings, set_realtime
+from dtsa_agent.ros.common.names import MODES
+from dtsa_agent.ros.common.node_process import ending, run_node
+from dtsa_agent.ros.common.parameters import check_parameters, declare_settings, from_parameter, swarm_wide_node
+from dtsa_agent.stop import Stop
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, AnswerLimits, ChannelConfig
 from dtsa_channel_sim.model.schedule import Change
@@ -70,9 +70,7 @@ class ChannelNodeSettings(AnswerLimits):
 
     slots: int = setting(0, "the run ends after so many slots; 0: by a signal only", minimum=0, maximum=2**31)
     mode: str = setting(
-        MODES[0],
-        "in lockstep all wait for each other; in real time each agent has a clock of its own",
-        choices=MODES,
+        MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own", choices=MODES
     )
     steps: int = setting(1, "control instants in a slot, as the agents have", minimum=1, maximum=255)
 
@@ -105,7 +103,7 @@ def _body(stop: Stop, supervised: bool) -> None:
             watch(channel, node, {"mode": run.mode, "channel": config.to_dict()}, space)
             follow_parameters(node, medium, channel.change_settings)
             if run.mode != MODES[0]:
-                take_priority(first)
+                set_realtime(first)
             channel.run(stop)
         finally:
             channel.close()

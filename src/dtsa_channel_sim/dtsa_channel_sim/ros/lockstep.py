@@ -10,11 +10,11 @@ from dtsa_msgs.msg import Transmission
 from rclpy.node import Node
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire.checks import OTHER_RUN, OTHER_SENDER, SLOT, Unusable
-from dtsa_agent.ros.common.wire.messages import TRANSMISSION
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import OTHER_RUN, OTHER_SENDER, SLOT, BadMessage
+from dtsa_agent.ros.common.messages import TRANSMISSION
+from dtsa_agent.ros.common.names import agent_names
+from dtsa_agent.ros.common.runs import Patience
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
@@ -59,7 +59,7 @@ class LockstepChannel(RosChannel):
             senders = sorted(frames)
             lengths = [len(frames[sender]) for sender in senders]
             verdict = self.model.arbitrate(slot, senders, lengths, self.answers.position)
-            self._observers.judged(slot, self.answers, frames, verdict)
+            self._observers.arbitrated(slot, self.answers, frames, verdict)
             slot += 1
 
     def _open(self, slot: int, frames: dict[int, bytes], verdict: Verdict | None) -> None:
@@ -88,7 +88,7 @@ class LockstepChannel(RosChannel):
             if data is None or not self._accept(slot, data):
                 if stop:
                     return False
-                repeat = self._wait(slot, patience.look(), repeat)
+                repeat = self._wait(slot, patience.spent_s(), repeat)
             self._housekeeping()
         return not stop
 
@@ -96,10 +96,12 @@ class LockstepChannel(RosChannel):
         """No answer has come: complain if that takes too long; return when the slot was last sent."""
         now = time.monotonic()
         if self._complaint and now > self._complaint_time + _GARBAGE_PATIENCE_S:
-            raise RemoteProtocolError(f"{named(self.answers.silent)} sent garbage in slot {slot}: {self._complaint}")
+            raise RemoteProtocolError(
+                f"{agent_names(self.answers.silent)} sent garbage in slot {slot}: {self._complaint}"
+            )
         limit = self._answer_s if slot else self._startup_s
         if waited_s > limit:
-            silent = named(self.answers.silent)
+            silent = agent_names(self.answers.silent)
             raise LocalProtocolError(f"{silent} did not answer slot {slot} within {limit:g} s: dead or hung?")
         if now - repeat > (_REPEAT_LATER_S if slot else REPEAT_S):
             self._publisher.publish(self._bytes)
@@ -114,9 +116,11 @@ class LockstepChannel(RosChannel):
             if message.slot < slot:
                 return False  # an answer that was asked for twice
             if message.slot > slot:
-                raise Unusable(SLOT, f"{named(message.agent)} answered slot {message.slot}, which has not begun")
+                raise BadMessage(
+                    SLOT, f"{agent_names(message.agent)} answered slot {message.slot}, which has not begun"
+                )
             return self.answers.add(message)
-        except Unusable as error:
+        except BadMessage as error:
             self.intake.drop(error.reason, str(error))
             if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent of this run sent it
                 self._complaint, self._complaint_time = str(error), time.monotonic()

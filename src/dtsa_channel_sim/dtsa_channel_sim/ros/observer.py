@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common.wire.messages import Fields
+from dtsa_agent.ros.common.messages import Fields
 from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import Verdict
 
@@ -35,33 +35,29 @@ class ChannelObserver:
     """Events of a run. An observer derives from this class and overrides those that it needs; the rest costs nothing.
 
     Observers are called in the order in which they were added. None of them can change what happens on the air. A slot
-    passes in this order: ``slot_published``, ``all_answered``, ``judged``, ``slot_over``. Answers are valid during the
-    call. Slot messages are CDR, their times ns of simulated time.
+    passes in this order: ``slot_published``, ``all_answered``, ``arbitrated``, ``slot_over``. Answers are valid during
+    the call. Slot messages are CDR, their times ns of simulated time.
     """
 
     def slot_published(self, slot: int, data: bytes, time_ns: int) -> None:
         """A slot message has been sent, which opens this slot or delivers its frame."""
 
     def frame_sent(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
-        """A frame goes on the air, in real time only.
-
-        :param slot: that the sender counts.
-        :param start_ns: of its transmission, from the start of slot 0.
-        """
+        """A frame goes on the air, in real time only: slot that its sender counts, start from that of slot 0."""
 
     def report(self, message: Fields) -> None:
         """A usable report has come in, in real time only; it may be of slots that are over."""
 
-    def begun(self, at_s: float) -> None:
+    def start_known(self, at_s: float) -> None:
         """It is known when slot 0 starts, s of ``time.monotonic()``, in real time only."""
 
     def stalled(self, from_ns: int, to_ns: int) -> None:
         """The channel stood still, in real time only; ns from the start of slot 0."""
 
     def all_answered(self, slot: int, answers: Answers) -> None:
-        """All agents (that still live) have answered a slot, with the true motion during the slot before."""
+        """All connected agents have answered a slot, with the true motion during the slot before."""
 
-    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         """The air has carried a slot's frames, by the sender's id."""
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
@@ -87,7 +83,7 @@ class ChannelObserver:
 
 
 class Referee(Protocol):
-    """Says when a run is over."""
+    """Decides when a run is over."""
 
     def over(self, slot: int, answers: Answers) -> bool:
         """Whether the run ends, asked when all agents have answered a slot and all observers know."""
@@ -117,24 +113,29 @@ class Observers(ChannelObserver):
     """Passes every event on to any number of observers; an error of one that is no DtsaError names it."""
 
     def __init__(self) -> None:
-        self._calls: dict[str, list[Callable[..., None]]] = {name: [] for name in _EVENTS}
+        self._close_calls: list[Callable[[], None]] = []
 
     def add(self, observer: ChannelObserver) -> None:
         """Add an observer; it is called after those that are there already."""
-        for name in _EVENTS:
-            if getattr(type(observer), name) is not getattr(ChannelObserver, name):
-                self._calls[name].append(_naming(observer, getattr(observer, name)))
+        for name, nothing in vars(ChannelObserver).items():
+            if name[0] == "_" or getattr(type(observer), name) is nothing:
+                continue
+            call = _naming(observer, getattr(observer, name))
+            if name == "close":
+                self._close_calls.append(call)
+            else:
+                earlier = vars(self).get(name)
+                setattr(self, name, _in_turn(earlier, call) if earlier else call)
 
     def close(self) -> None:
         """Close all observers, also when some of them fail.
 
         :raises DtsaError: the first failure.
         """
-        if not self._calls["close"]:
+        if not self._close_calls:
             return
-        close = self._calls["close"].pop(0)
         try:
-            close()
+            self._close_calls.pop(0)()
         except DtsaError:
             with suppress(DtsaError):
                 self.close()
@@ -143,7 +144,7 @@ class Observers(ChannelObserver):
 
 
 def _naming(observer: ChannelObserver, event: Callable[..., None]) -> Callable[..., None]:
-    def call(*arguments: object) -> None:
+    def call(*arguments: Any) -> None:
         try:
             event(*arguments)
         except DtsaError:
@@ -154,14 +155,9 @@ def _naming(observer: ChannelObserver, event: Callable[..., None]) -> Callable[.
     return call
 
 
-def _forward(event: str) -> Any:
-    def forward(self: Observers, *arguments: object) -> None:
-        for call in self._calls[event]:
-            call(*arguments)
+def _in_turn(first: Callable[..., None], second: Callable[..., None]) -> Callable[..., None]:
+    def call(*arguments: Any) -> None:
+        first(*arguments)
+        second(*arguments)
 
-    return forward
-
-
-_EVENTS = tuple(name for name, member in vars(ChannelObserver).items() if name[0] != "_" and callable(member))
-for _event in set(_EVENTS) - {"close"}:
-    setattr(Observers, _event, _forward(_event))
+    return call

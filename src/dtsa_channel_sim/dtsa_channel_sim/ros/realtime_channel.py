@@ -1,4 +1,7 @@
-"""The channel in real time: every agent sends when its own clock says so, and the air decides by overlap."""
+"""The channel in real time: every agent sends when its own clock says so, and the air decides by overlap.
+
+Times are ns from the start of slot 0, unless said otherwise; positions are (3, N), m, frame map.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +18,16 @@ from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.frame import named_in
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.loop import Feed
-from dtsa_agent.ros.common.wire.checks import RANGE, SIZES, Unusable, check_start
-from dtsa_agent.ros.common.wire.messages import Fields, header_of, ns_of, read_report
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.messages import Fields, header_of, ns_of, read_report
 from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .answers import Accounts, Answers, Delivered
+from .answers import Accounts, Answers, DeliveredFrame
 from .ros_channel import RosChannel
 from .roster import Attendance, RollCall
 
@@ -37,7 +40,7 @@ _PATIENCE_SLOTS, _PATIENCE_NS = 10, 500_000_000  # an account waits for reports 
 _RECOVERY_NS = 4 * _NS
 _AHEAD = 100  # slots: a report from farther in the future is none
 _KEEP_NS = 10 * _NS  # an agent may report so late that it received a frame
-# What one pass of the loop does at most: frames, reports. Then it looks at the clock and at signals again.
+# What one pass of the loop does at most: frames, reports. Then it checks the clock and signals again.
 _FRAMES, _REPORTS = 64, 2
 _TIGHT = 0.6  # of a slot: a round of messages that takes longer leaves too little for the rest
 _GRACE = 0.05  # of a slot: frames are handed over ahead of their start; one that is late by less still collides
@@ -46,35 +49,32 @@ _STALL_SLOTS, _STALL_NS = 5, 50_000_000
 _MOST_STALLS = 1000  # kept one by one; later ones are only counted
 _BEHIND_NS, _TOO_LONG_NS = 1 * _NS, 8 * _NS  # a run that is that far behind for that long will not catch up
 
-Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
+SentFrame = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
 _read_frame = partial(deserialize_message, message_type=Frame)
 
 
 class Pace:
-    """Whether the channel keeps up with its time line: how late it is, and when it stood still.
-
-    Follows the passes of the channel's loop. Times are ns from the start of slot 0.
-    """
+    """Whether the channel keeps up with its time line, by the passes of its loop: how late it is, when it stalled."""
 
     def __init__(self, slot_ns: int) -> None:
         self._stall_ns = max(_STALL_SLOTS * slot_ns, _STALL_NS)
         self._last_ns = 0
         self.lag = Delays()  # from when a frame could have been delivered to when it was
-        self.stalls: list[tuple[int, int]] = []  # ns from the start of slot 0: from, to
+        self.stalls: list[tuple[int, int]] = []  # from, to
         self.stall_count = 0
         self.last_stall = (0, 0)
         self._behind_since_ns: int | None = None
 
     def passed(self, now_ns: int) -> int:
         """The next pass begins; return for how long the channel stood still before it, ns, 0 if it did not."""
-        gap, begun = now_ns - self._last_ns, self._last_ns
+        gap, before = now_ns - self._last_ns, self._last_ns
         self._last_ns = now_ns
         if gap < self._stall_ns:
             return 0
         self.stall_count += 1
+        self.last_stall = before, now_ns
         if len(self.stalls) < _MOST_STALLS:
-            self.stalls.append((begun, now_ns))
-        self.last_stall = begun, now_ns
+            self.stalls.append(self.last_stall)
         return gap
 
     def falls_behind(self, now_ns: int, done_ns: int) -> bool:
@@ -93,52 +93,52 @@ class Pace:
 
 
 class LiveAir:
-    """One time line of frames: time is settled a little behind the clock, when all handed over in time is known.
-
-    Times are ns from the start of slot 0, positions (3, N), m, frame map.
-    """
+    """One time line of frames: time is settled a little behind the clock, when all handed over in time is known."""
 
     def __init__(self, channel: Channel) -> None:
         config = channel.config
-        self._air: Air[Sent] = Air(channel)
+        self._air: Air[SentFrame] = Air(channel)
         # A delivery may come no earlier than the frame arrives.
         self.hold_ns = max(round(_GRACE * config.slot_ns), config.airtime.from_radio_ns(0))
-        self.late = 0  # frames that came when the air had been settled past their start, and were dropped
         self._window_ns = round(_WINDOW * config.slot_ns)
-        self.frames: dict[Sent, bytes] = {}  # that are or were on the air, until their slot is closed
-        self._arriving: list[tuple[int, int, FrameVerdict[Sent]]] = []  # what lines still carry: a heap by arrival
+        self.frames: dict[SentFrame, bytes] = {}  # that are or were on the air, until their slot is closed
+        self._arriving: list[tuple[int, int, FrameVerdict[SentFrame]]] = []  # on lines: a heap by arrival
         self._count = 0
-        self._settled_ns = -NEVER
+        self._resolved_ns = -NEVER
+
+    @property
+    def late(self) -> int:
+        """Frames that came when the air had been settled past their start, and were dropped."""
+        return self._air.late
 
     @property
     def waits(self) -> bool:
         """Whether a frame waits for its delivery."""
         return bool(self._air.pending or self._arriving)
 
-    def hand_over(self, key: Sent, start_ns: int, data: bytes) -> bool:
-        """Put a frame on the air at ``start_ns``; return False if it came too late."""
+    def hand_over(self, key: SentFrame, start_ns: int, data: bytes) -> bool:
+        """Put a frame on the air; return False if it came too late."""
         if not self._air.begin(key, key[1], start_ns, len(data)):
-            self.late += 1
             return False
         self.frames[key] = data
         return True
 
-    def settle(self, now: int, positions: Positions) -> list[FrameVerdict[Sent]]:
+    def pop_arrived(self, now: int, positions: Positions) -> list[FrameVerdict[SentFrame]]:
         """Return the verdicts on all frames that have arrived."""
         ripe, late = now - self.hold_ns, now - max(self.hold_ns, self._window_ns)
         while (due := self._air.due_ns) <= ripe:
-            self._settle(due, positions)
-        self._settle(late, positions)
+            self._resolve(due, positions)
+        self._resolve(late, positions)
         arrived = []
         while self._arriving and self._arriving[0][0] <= now:
             arrived.append(heappop(self._arriving)[2])
         return arrived
 
-    def _settle(self, until_ns: int, positions: Positions) -> None:
-        if until_ns <= self._settled_ns:
+    def _resolve(self, until_ns: int, positions: Positions) -> None:
+        if until_ns <= self._resolved_ns:
             return
-        self._settled_ns = until_ns
-        for verdict in self._air.settle(until_ns, positions):
+        self._resolved_ns = until_ns
+        for verdict in self._air.resolve(until_ns, positions):
             self._count += 1
             heappush(self._arriving, (verdict.arrival_ns, self._count, verdict))
 
@@ -159,18 +159,11 @@ class RealtimeChannel(RosChannel):
     mode = "realtime"
 
     def __init__(
-        self,
-        node: Node,
-        channel: Channel,
-        steps: int,
-        answer_s: float = 0.0,
-        swarm_namespace: str = names.SWARM,
+        self, node: Node, channel: Channel, steps: int, answer_s: float = 0.0, swarm_namespace: str = names.SWARM,
         **more: Any,
-    ) -> None:
-        super().__init__(
-            node, channel, steps, names.REALTIME_WAITING, (Frame, names.AIR_FRAME), swarm_namespace=swarm_namespace,
-            **more,
-        )  # fmt: skip
+    ) -> None:  # fmt: skip
+        air = (Frame, names.AIR_FRAME)
+        super().__init__(node, channel, steps, names.REALTIME_WAITING, air, swarm_namespace=swarm_namespace, **more)
         qos = names.lockstep_qos(names.REALTIME_WAITING * self.agents)
         self._reports = Feed(node, Report, f"{swarm_namespace}/{names.REPORT}", qos, raw=True)
         self.accounts = Accounts(self.agents, steps, max(100, _KEEP_NS // self.slot_ns))
@@ -179,27 +172,16 @@ class RealtimeChannel(RosChannel):
         self.round_ms: float | None = None  # of a round of messages before slot 0, median
         self._attendance = Attendance(self.agents, self.lost)
         self._steps = steps
-        self._zero = 0
+        self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0
         self._start_published_s = 0.0  # time.monotonic() of the last start message
         self._leisure_ns = -NEVER  # when there was time for all that is not the air
-        self._settled: dict[int, list[FrameVerdict[Sent]]] = {}
+        self._resolved: dict[int, list[FrameVerdict[SentFrame]]] = {}  # by slot that is not closed
         self._recovered_ns = 0  # when all that was sent during the last stall should have come
         self._newest = -1  # slot: last one reported by any agent
         self._lag_ns = 0  # the swarm's common time runs with the mean of its clocks: its slots start so much later
-        airtime = channel.config.airtime
-        self._longest = airtime.longest
-        self._close_ns = self.air.hold_ns + airtime.latest_ns(airtime.longest) + _TICK_NS
+        self._longest = channel.config.airtime.longest
+        self._close_ns = self.air.hold_ns + channel.config.airtime.latest_ns(self._longest) + _TICK_NS
         self._patience_ns = max(_PATIENCE_SLOTS * self.slot_ns, _PATIENCE_NS)
-
-    @property
-    def late_frames(self) -> int:
-        """Number of frames that came when the air had been settled past their start, and were dropped."""
-        return self.air.late
-
-    @property
-    def missed(self) -> int:
-        """Entries of reports that came too late to count."""
-        return self.accounts.missed
 
     def _run(self, stop: object) -> None:
         if self._prepare(stop):
@@ -211,7 +193,7 @@ class RealtimeChannel(RosChannel):
         finally:
             self._reports.close()
 
-    # Who takes part.
+    # Which agents take part.
 
     def expect_later(self, agent: int, place: NDArray[np.float64]) -> None:
         """Note that an agent comes after the start; its vehicle waits at a place, (3,) m."""
@@ -240,18 +222,18 @@ class RealtimeChannel(RosChannel):
         """Wait until all agents have reported, and publish when slot 0 starts; return False when stopped."""
         if not self._call(stop, self.lost):
             return False
-        accounts = Accounts(self.agents, self._steps, 1)
-        roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling, accounts)
-        everybody = set(range(1, self.agents + 1))
-        awaited = set(everybody)
+        roll_call = RollCall(
+            self._publisher, self._reports, self.run_id, self._calling, Accounts(self.agents, self._steps, 1)
+        )
+        awaited = set(range(1, self.agents + 1))
 
-        def look() -> set[int]:
+        def still_awaited() -> set[int]:
             awaited.difference_update(roll_call.present())
             self.answers.missing = len(awaited)
             self.answers.answered[:] = [agent not in awaited for agent in range(1, self.agents + 1)]
             return awaited - self.lost
 
-        if not self._await_all(stop, roll_call.call, look, _TICK_NS):
+        if not self._await_all(stop, roll_call.call, still_awaited, _TICK_NS):
             return False
         # An agent that is late with its first report has been nowhere else.
         answers = roll_call.answers
@@ -259,16 +241,17 @@ class RealtimeChannel(RosChannel):
         self.answers = answers
         absent = set(self.lost)
 
-        def disturbed() -> bool:
+        def is_disturbed() -> bool:
             self._housekeeping()
             return bool(stop) or self.lost != absent
 
-        self.round_ms = roll_call.round_ms(everybody - absent, _TIGHT * self.slot_ns / 1e6, disturbed)
+        present = set(range(1, self.agents + 1)) - absent
+        self.round_ms = roll_call.round_ms(present, _TIGHT * self.slot_ns / 1e6, is_disturbed)
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS
         self._publish_start()
-        self._observers.begun(self._zero / _NS)
+        self._observers.start_known(self._zero / _NS)
         self._attendance.begin()
         return True
 
@@ -285,7 +268,6 @@ class RealtimeChannel(RosChannel):
     # The time line.
 
     def _now(self) -> int:
-        """ns from the start of slot 0."""
         return time.monotonic_ns() - self._zero
 
     def _fly(self, stop: object) -> None:
@@ -303,14 +285,14 @@ class RealtimeChannel(RosChannel):
                     self._accept_frame(data)
                 data = self.loop.take()
             now = self._now()
-            self._settle(now)
+            self._deliver_arrived(now)
             more = False
             if self._at_leisure(now):
                 more = self._read_reports()
-                if self._due(now):
+                if self._can_close(now):
                     if not self._close_slot():
                         return
-                    more = more or self._due(now)
+                    more = more or self._can_close(now)
                 if time.monotonic() - self._start_published_s > _START_S:
                     self._publish_start()
                 self._housekeeping()
@@ -326,23 +308,22 @@ class RealtimeChannel(RosChannel):
 
     def _resume(self, now: int) -> None:
         """After a stall: what was handed over meanwhile is too late for the air, and silence counts for no agent."""
-        self._settle(now)
-        begun, ended = self.pace.last_stall
-        self._recovered_ns = ended + (_RECOVERY_NS if ended - begun > self._patience_ns else self._patience_ns)
-        self._attendance.excuse(ended - begun, self._recovered_ns)
-        self._observers.stalled(begun, ended)
+        self._deliver_arrived(now)
+        before, after = self.pace.last_stall
+        self._recovered_ns = after + (_RECOVERY_NS if after - before > self._patience_ns else self._patience_ns)
+        self._attendance.excuse(after - before, self._recovered_ns)
+        self._observers.stalled(before, after)
 
     def _falls_behind(self, now: int) -> bool:
         """Whether the run cannot keep up, by its accounts or by the agents' reports."""
         accounted = (self.slot + 2) * self.slot_ns + self._patience_ns
         reported = (self._newest + 2) * self.slot_ns + self._patience_ns
-        alive = len(self.lost) < self.agents
-        if not self.pace.falls_behind(now, min(accounted, reported) if alive else accounted):
+        all_lost = len(self.lost) == self.agents
+        if not self.pace.falls_behind(now, accounted if all_lost else min(accounted, reported)):
             return False
-        who = "the channel" if accounted <= reported else "the agents"
-        behind = (now - min(accounted, reported)) / _NS
+        behind = "the channel is" if accounted <= reported else "the agents are"
         self.fell_behind = (
-            f"the machine does not keep up: {who} {'is' if who == 'the channel' else 'are'} {behind:.1f} s behind, "
+            f"the machine does not keep up: {behind} {(now - min(accounted, reported)) / _NS:.1f} s behind, "
             f"since {self.pace.behind_since_s:.1f} s; longer slots or fewer processes would help"
         )
         return True
@@ -350,49 +331,41 @@ class RealtimeChannel(RosChannel):
     def _accept_frame(self, data: bytes) -> None:
         """Put a frame on the time line.
 
-        :raises Unusable: if it cannot be one.
+        :raises BadMessage: if it cannot be one.
         """
         message = self._decoded(data, Frame, _read_frame)
-        slot, agent, length = message.slot, message.agent, len(message.data)
+        slot, agent, frame = message.slot, message.agent, bytes(message.data)
         if agent in self.lost:
             self._meet_processes()  # a new process tells about itself before it sends anything else
         self.roster.check_frame(agent, time.monotonic(), self.loop.sender)
         start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
-        if not 1 <= length <= self._longest:
-            raise Unusable(SIZES, f"a frame of {length} bytes")
-        if named_in(bytes(message.data)) != (agent, slot & 0xFFFFFFFF):
-            raise Unusable(RANGE, f"a frame for cf{agent} and slot {slot} that does not name them")
+        if not 1 <= len(frame) <= self._longest:
+            raise BadMessage(SIZES, f"a frame of {len(frame)} bytes")
+        if named_in(frame) != (agent, slot & 0xFFFFFFFF):
+            raise BadMessage(RANGE, f"a frame for cf{agent} and slot {slot} that does not name them")
         check_start(start_ns, now, early_ns=_AHEAD * self.slot_ns)
         check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
-        key = (slot, agent)
-        if key in self.air.frames:
-            return
-        frame = bytes(message.data)
-        if not self.air.hand_over(key, start_ns, frame):
-            return  # too late: no agent hears it
+        if (slot, agent) in self.air.frames or not self.air.hand_over((slot, agent), start_ns, frame):
+            return  # it is there already, or too late: no agent hears it
         if slot > self.slot:
             self.accounts[slot].frames[agent] = frame
         self._observers.frame_sent(slot, agent, frame, start_ns)
         self._attendance.hear((agent,), now)
 
-    def _settle(self, now: int) -> None:
-        """Deliver all frames whose time has come."""
-        for verdict in self.air.settle(now, self.answers.position):
-            self._deliver(verdict)
-
-    def _deliver(self, verdict: FrameVerdict[Sent]) -> None:
-        """Send a frame that has left the air to those that received it."""
-        slot, sender = verdict.frame_id
-        self._settled.setdefault(max(slot, self.slot + 1), []).append(verdict)
-        self.pace.lag.add(self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns))
-        if not verdict.received.any():
-            return
-        frame = self.air.frames[verdict.frame_id]
-        time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
-        data = self._pack_slot(time_ns, slot, slot, (sender,), (frame,), verdict.received[None])
-        self._publisher.publish(data)
-        self.accounts.deliver(slot, sender, Delivered(frame, verdict.arrival_ns, verdict.received))
-        self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
+    def _deliver_arrived(self, now: int) -> None:
+        """Send all frames whose time has come to those that received them."""
+        for verdict in self.air.pop_arrived(now, self.answers.position):
+            slot, sender = verdict.frame_id
+            self._resolved.setdefault(max(slot, self.slot + 1), []).append(verdict)
+            self.pace.lag.add(self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns))
+            if not verdict.received.any():
+                continue
+            frame = self.air.frames[verdict.frame_id]
+            time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
+            data = self._pack_slot(time_ns, slot, slot, (sender,), (frame,), verdict.received[None])
+            self._publisher.publish(data)
+            self.accounts.deliver(slot, sender, DeliveredFrame(frame, verdict.arrival_ns, verdict.received))
+            self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
 
     # The accounts.
 
@@ -409,7 +382,7 @@ class RealtimeChannel(RosChannel):
     def _accept_report(self, message: Fields) -> None:
         """Add one process's report to the accounts.
 
-        :raises Unusable: if it cannot be one.
+        :raises BadMessage: if it cannot be one.
         """
         if self.lost and not self.lost.isdisjoint(message.agent[: self.agents]):
             self._meet_processes()
@@ -421,8 +394,8 @@ class RealtimeChannel(RosChannel):
         self._attendance.hear(message.agent, now)
         self._observers.report(message)
 
-    def _due(self, now: int) -> bool:
-        """Whether the next slot can be closed: its frames are settled, all agents have reported for the one after."""
+    def _can_close(self, now: int) -> bool:
+        """Whether the next slot can be closed: its frames are resolved, all agents have reported for the one after."""
         end = (self.slot + 2) * self.slot_ns + self._lag_ns
         if now < end + self._close_ns:
             return False
@@ -438,9 +411,11 @@ class RealtimeChannel(RosChannel):
         if not slot and not self._goes_on(0, book):
             return False
         self.answers = book
-        frames, verdict = self._verdict(slot)
-        book.taken_in = self.accounts.taken_in(slot)
-        self._observers.judged(slot, book, frames, verdict)
+        resolved = self._resolved.pop(slot, [])
+        frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in resolved}
+        verdict = Verdict.of([verdict.sender for verdict in resolved], resolved)
+        book.receipts = self.accounts.receipts(slot)
+        self._observers.arbitrated(slot, book, frames, verdict)
         self._publish_clock(names.slot_time_ns(slot, self.slot_ns))
         self._observers.slot_over(slot, book, verdict)
         self.slot = slot
@@ -462,9 +437,3 @@ class RealtimeChannel(RosChannel):
         for agent in self._attendance.silent_too_long(book.silent):
             self.lose(agent)
         return book
-
-    def _verdict(self, slot: int) -> tuple[dict[int, bytes], Verdict]:
-        """Return what the air did in one slot, frame by frame."""
-        settled = self._settled.pop(slot, [])
-        frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in settled}
-        return frames, Verdict.of([verdict.sender for verdict in settled], settled)

@@ -15,15 +15,13 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.process.loop import Feed, Loop
-from dtsa_agent.ros.common.process.runs import Run, run_text
-from dtsa_agent.ros.common.process.waiting import Patience
-from dtsa_agent.ros.common.wire import checks
-from dtsa_agent.ros.common.wire.checks import Intake, Unusable
-from dtsa_agent.ros.common.wire.messages import SLOT, time_of
-from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common import checks, names
+from dtsa_agent.ros.common.cdr import pack_received
+from dtsa_agent.ros.common.checks import BadMessage, Intake
+from dtsa_agent.ros.common.loop import Feed, Loop
+from dtsa_agent.ros.common.messages import SLOT, time_of
+from dtsa_agent.ros.common.names import agent_names
+from dtsa_agent.ros.common.runs import Patience, Run, run_text
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
 
@@ -57,19 +55,10 @@ class RosChannel:
     mode = "lockstep"
 
     def __init__(
-        self,
-        node: Node,
-        channel: Channel,
-        steps: int,
-        waiting: int,
-        input: tuple[type, str],
-        referee: Referee | None = None,
-        swarm_namespace: str = names.SWARM,
-        startup_s: float = 60.0,
-        end_s: float = 4.0,
-        run: Run | None = None,
-        agreed: Mapping[str, Any] | None = None,
-    ) -> None:
+        self, node: Node, channel: Channel, steps: int, waiting: int, input: tuple[type, str],
+        referee: Referee | None = None, swarm_namespace: str = names.SWARM, startup_s: float = 60.0,
+        end_s: float = 4.0, run: Run | None = None, agreed: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
         self.node, self.model = node, channel
         self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
         self._identity = run or Run.draw()
@@ -99,11 +88,6 @@ class RosChannel:
     def run_id(self) -> int:
         """The run's id."""
         return self._identity.number
-
-    @property
-    def unusable(self) -> int:
-        """Number of messages that the channel has dropped."""
-        return self.intake.total
 
     def dropped(self) -> dict[str, int]:
         """Return the number of messages and frames that the channel and the agents have dropped, by reason."""
@@ -147,28 +131,28 @@ class RosChannel:
         :raises ConfigError: when two do not fit together, or another channel is there.
         :raises LocalProtocolError: when some do not answer in time.
         """
-        with self._other_channels() as look_for_others:
+        with self._watch_other_channels() as check_others:
 
             def call() -> None:
                 data = self._calling
                 self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, slot=names.FIRST_CALL, data=data))
 
-            def look() -> set[int]:
-                self._hear_processes()
-                look_for_others()
+            def awaited() -> set[int]:
+                self._read_processes()
+                check_others()
                 done = self.roster.complete(time.monotonic(), absent)
                 return set() if done else set(self.roster.missing) - absent or {0}
 
-            self.roster.closed = self._await_all(stop, call, look, _CALL_NS)
+            self.roster.closed = self._await_all(stop, call, awaited, _CALL_NS)
         return self.roster.closed
 
-    def _await_all(self, stop: object, call: Callable[[], None], look: Callable[[], set[int]], wait_ns: int) -> bool:
+    def _await_all(self, stop: object, call: Callable[[], None], awaited: Callable[[], set[int]], wait_ns: int) -> bool:
         """Call again and again until no agent is awaited any more; return False when stopped.
 
         :raises LocalProtocolError: when some do not answer in time.
         """
         patience, repeat = Patience(), 0.0
-        while awaited := look():
+        while agents := awaited():
             if stop:
                 return False
             now = time.monotonic()
@@ -177,40 +161,42 @@ class RosChannel:
                 call()
             self.loop.wait(wait_ns)  # what comes before the run begins does not count
             self._housekeeping()
-            if patience.look() > self._startup_s:
-                raise LocalProtocolError(f"{named(awaited)} did not report within {self._startup_s:g} s: dead or hung?")
+            if patience.spent_s() > self._startup_s:
+                raise LocalProtocolError(
+                    f"{agent_names(agents)} did not report within {self._startup_s:g} s: dead or hung?"
+                )
         return True
 
     @contextmanager
-    def _other_channels(self) -> Iterator[Callable[[], None]]:
+    def _watch_other_channels(self) -> Iterator[Callable[[], None]]:
         """Listen to the channel's own topic; give a function that checks what others publish there."""
         topic = self._publisher.topic_name
         feed = Feed(self.node, Slot, topic, names.lockstep_qos(), intake=self.intake)
-        heard: dict[int, float] = {}  # by run: when it was first heard
+        first_s: dict[int, float] = {}  # by run: when its first message came
 
-        def look() -> None:
+        def check() -> None:
             for _ in range(_MOST_PROCESSES):
                 message = feed.take()
                 if message is None:
                     return
-                if message.run in (0, self.run_id) or len(heard) >= _MOST_PROCESSES:
+                if message.run in (0, self.run_id) or len(first_s) >= _MOST_PROCESSES:
                     continue
                 with self.intake.guard():
                     checks.check_slot(message, self.agents)
                     now = time.monotonic()
-                    waited = now - heard.setdefault(message.run, now)
-                    others = ", ".join(self._other_nodes(topic)) if waited > _OTHER_CHANNEL_S else ""
+                    waited = now - first_s.setdefault(message.run, now)
+                    others = ", ".join(self._channel_nodes(topic)) if waited > _OTHER_CHANNEL_S else ""
                     # The graph may know of a publisher before it knows the name of its node.
                     if others and (_UNNAMED not in others or waited > _OTHER_CHANNEL_S + _NAME_S):
                         raise ConfigError("run", str(self._identity), f"no other channel on {topic}; there is {others}")
 
         try:
-            yield look
+            yield check
         finally:
             feed.close()
             self.node.destroy_subscription(feed.subscription)
 
-    def _other_nodes(self, topic: str) -> list[str]:
+    def _channel_nodes(self, topic: str) -> list[str]:
         """Return the nodes that publish on a topic beside this one."""
         nodes = [
             _UNNAMED if "UNKNOWN_" in info.node_name else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
@@ -223,14 +209,14 @@ class RosChannel:
     def _decoded(self, data: bytes, kind: type, read: Callable[[bytes], Any]) -> Any:
         """Return a message of this run.
 
-        :raises Unusable: if it is none.
+        :raises BadMessage: if it is none.
         """
         try:
             message = read(data)
         except Exception:  # rclpy has no common base for what a message can do to it
-            raise Unusable(checks.UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
+            raise BadMessage(checks.UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
         if message.run != self.run_id:
-            raise Unusable(checks.OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
+            raise BadMessage(checks.OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
         return message
 
     def _pack_slot(
@@ -242,8 +228,8 @@ class RosChannel:
             b"".join(frames), b"" if mask is None else pack_received(mask),
         ))  # fmt: skip
 
-    def _hear_processes(self) -> None:
-        """Process what processes say about themselves.
+    def _read_processes(self) -> None:
+        """Process the messages of processes about themselves.
 
         :raises ConfigError: before the run has begun, when two do not fit together.
         """
@@ -267,9 +253,9 @@ class RosChannel:
         self._publisher.publish(Slot(run=self.run_id, phase=Slot.REFUSE, data=data))
 
     def _meet_processes(self) -> None:
-        """Process what processes say about themselves, and decide about those that came late."""
-        self._hear_processes()
-        for process, error in self.roster.settle(time.monotonic(), self.lost) if self.roster.closed else ():
+        """Process the messages of processes about themselves, and decide about those that came late."""
+        self._read_processes()
+        for process, error in self.roster.refuse_rivals(time.monotonic(), self.lost) if self.roster.closed else ():
             self._refuse(process, error)
 
     def _housekeeping(self) -> None:
@@ -321,4 +307,4 @@ class RosChannel:
             if self._publisher.wait_for_all_acked(Duration(seconds=REPEAT_S)):
                 break
             self._publish_end()
-        self._hear_processes()  # they end with their last counts
+        self._read_processes()  # they end with their last counts

@@ -17,20 +17,19 @@ from rclpy.publisher import Publisher
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import settings_hash
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.process.loop import Feed
-from dtsa_agent.ros.common.process.runs import run_text
-from dtsa_agent.ros.common.wire import checks
-from dtsa_agent.ros.common.wire.checks import OnePublisher, Unusable
-from dtsa_agent.ros.common.wire.messages import Fields, read_report
+from dtsa_agent.ros.common import checks, names
+from dtsa_agent.ros.common.checks import BadMessage, PublisherGuard
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.messages import Fields, read_report
+from dtsa_agent.ros.common.names import agent_names
+from dtsa_agent.ros.common.runs import run_text
 
 from .answers import Accounts, Answers
 
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s
 _LEFT_OVER_S = 3.0  # agents whose channel has gone end within this time
-_MOST_STRANGERS = 256
+_MOST_OTHERS = 256  # processes of other runs, or for the same agents
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 _RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
 _ROUNDS, _LONGEST_S = 20, 0.5  # of one measurement
@@ -47,17 +46,14 @@ class Member:
     process: int
     node: str
     ids: tuple[int, ...]
-    heard_s: float  # monotonic, when it last told about itself
+    heard_s: float  # monotonic, when its last message about itself came
     sender: bytes | None  # participant of all its messages; None: not known
+    publisher: PublisherGuard
     dropped: dict[str, int] = field(default_factory=dict)
-    publisher: OnePublisher = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.publisher = OnePublisher(self.sender)
 
 
 class Roster:
-    """Collects what the processes say about themselves before slot 0, and keeps out those that do not fit.
+    """Collects what processes publish about themselves before slot 0, and keeps out those that do not fit.
 
     All must share the settings ``agreed``. Times are s, monotonic; ``sender`` is the sender of a message, None: not
     known; ``absent`` are ids of agents that are not waited for.
@@ -77,7 +73,7 @@ class Roster:
 
     @property
     def missing(self) -> list[int]:
-        """Ids of the agents whose processes have not told about themselves."""
+        """Ids of the agents whose processes are not known yet."""
         return [agent for agent in range(1, self._agents + 1) if agent not in self._of]
 
     def complete(self, now_s: float, absent: Set[int] = frozenset()) -> bool:
@@ -88,7 +84,7 @@ class Roster:
                 self._replace(rival)
         return not self._rivals and not set(self.missing) - absent
 
-    def settle(self, now_s: float, absent: Set[int]) -> list[tuple[int, ConfigError]]:
+    def refuse_rivals(self, now_s: float, absent: Set[int]) -> list[tuple[int, ConfigError]]:
         """Decide about processes that came while the run was under way; return those refused, and why."""
         refused = []
         for process, (rival, since_s) in list(self._rivals.items()):
@@ -103,21 +99,21 @@ class Roster:
         return refused
 
     def hear(self, message: Process, now_s: float, sender: bytes | None) -> None:
-        """Process what a process says about itself.
+        """Process a message of a process about itself.
 
         :raises ConfigError: if it cannot take part, naming setting, both values and node.
-        :raises Unusable: for a message that cannot be, or of another run.
+        :raises BadMessage: for a message that cannot be, or of another run.
         """
         checks.check_process(message, self._agents)
         message.node = checks.plain(message.node)
         if message.run != self._run:
-            self._hear_other(message, now_s)
-            raise Unusable(checks.OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
+            self._note_other_run(message, now_s)
+            raise BadMessage(checks.OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
         member = self._members.get(message.process) or self._meet(message, now_s, sender)
         if member.sender != sender:
-            raise Unusable(checks.OTHER_SENDER, f"a message about {message.node} that is not its own")
+            raise BadMessage(checks.OTHER_SENDER, f"a message about {message.node} that is not its own")
         if member.ids != tuple(message.agent):
-            raise Unusable(checks.UNKNOWN, f"{message.node} for other agents than before")
+            raise BadMessage(checks.UNKNOWN, f"{message.node} for other agents than before")
         member.heard_s = now_s
         member.dropped = dict(zip(message.dropped_reason, message.dropped, strict=True))
         for rival, since_s in () if self.closed else self._rivals.values():
@@ -126,15 +122,16 @@ class Roster:
                 raise self._conflict(rival, taken)  # both are alive
 
     def _meet(self, message: Process, now_s: float, sender: bytes | None) -> Member:
-        """A process tells about itself for the first time."""
+        """A process publishes about itself for the first time."""
         rival = self._rivals.get(message.process)
         if rival is not None:
             return rival[0]
-        member = Member(message.process, message.node, tuple(message.agent), now_s, sender)
+        guard = PublisherGuard(sender)
+        member = Member(message.process, message.node, tuple(message.agent), now_s, sender, guard)
         self._compare(message)
         if any(agent in self._of for agent in member.ids):
-            if len(self._rivals) >= _MOST_STRANGERS:
-                raise Unusable(checks.UNKNOWN, "too many processes for the same agents")
+            if len(self._rivals) >= _MOST_OTHERS:
+                raise BadMessage(checks.UNKNOWN, "too many processes for the same agents")
             self._rivals[member.process] = (member, now_s)
         else:
             self._replace(member)
@@ -156,21 +153,21 @@ class Roster:
     def _conflict(self, rival: Member, taken: Set[int]) -> ConfigError:
         nodes = ", ".join(sorted({self._of[agent].node for agent in taken}))
         return ConfigError(
-            f"ids of {rival.node}", list(rival.ids), f"agents of no other process; {nodes} has {named(taken)}"
+            f"ids of {rival.node}", list(rival.ids), f"agents of no other process; {nodes} has {agent_names(taken)}"
         )
 
     def _compare(self, message: Process) -> None:
         """Compare a process's settings with those that all share.
 
         :raises ConfigError: if they differ.
-        :raises Unusable: if they are none.
+        :raises BadMessage: if they are none.
         """
         try:
             given = checks.parse_json(message.settings)
         except ValueError:
             given = None
         if not isinstance(given, dict) or settings_hash(given) != message.settings_hash:
-            raise Unusable(checks.RANGE, f"{message.node} says nothing about its settings")
+            raise BadMessage(checks.RANGE, f"{message.node} says nothing about its settings")
         for name in sorted(self._agreed):
             if name not in given or given[name] != self._agreed[name]:
                 allowed = f"{self._agreed[name]!r}, as {self._agreed_by[name]} has it"
@@ -180,33 +177,25 @@ class Roster:
             self._agreed.update((name, given[name]) for name in further)
             self._agreed_by.update(dict.fromkeys(further, message.node))
 
-    def _hear_other(self, message: Process, now_s: float) -> None:
+    def _note_other_run(self, message: Process, now_s: float) -> None:
         """A process of another run answers our call.
 
         :raises ConfigError: if it stays.
         """
-        if self.closed or len(self._left_over) >= _MOST_STRANGERS:
+        if self.closed or len(self._left_over) >= _MOST_OTHERS:
             return
         since_s = self._left_over.setdefault(message.process, now_s)
         if now_s - since_s > _LEFT_OVER_S:
-            allowed = f"no process of another run on these topics; it has {named(message.agent)}"
+            allowed = f"no process of another run on these topics; it has {agent_names(message.agent)}"
             raise ConfigError(f"run of {message.node}", run_text(message.run), allowed)
 
     def check_sender(self, ids: Any, now_s: float, sender: bytes | None) -> None:
         """Check that a message can be from the process that has some agents."""
-        member = self._groups.get(ids.tobytes())
-        if member is None:
-            raise Unusable(checks.UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
-        if not member.publisher.admits(now_s, sender):
-            raise Unusable(checks.OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}")
+        _admit(self._groups.get(ids.tobytes()), lambda: f"a message for {agent_names(ids[:8])}", now_s, sender)
 
     def check_frame(self, agent: int, now_s: float, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
-        member = self._of.get(agent)
-        if member is None:
-            raise Unusable(checks.UNKNOWN, f"a frame of cf{agent}, which no process has")
-        if not member.publisher.admits(now_s, sender):
-            raise Unusable(checks.OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
+        _admit(self._of.get(agent), lambda: f"a frame of cf{agent}", now_s, sender)
 
     def dropped(self) -> dict[str, int]:
         """Return the number of messages that all processes have dropped, by reason."""
@@ -214,6 +203,13 @@ class Roster:
         for member in self._members.values():
             checks.add_counts(total, member.dropped)
         return total
+
+
+def _admit(member: Member | None, what: Callable[[], str], now_s: float, sender: bytes | None) -> None:
+    if member is None:
+        raise BadMessage(checks.UNKNOWN, f"{what()}, which no process has")
+    if not member.publisher.admits(now_s, sender):
+        raise BadMessage(checks.OTHER_SENDER, f"{what()} that is not of {member.node}")
 
 
 def _key(ids: tuple[int, ...]) -> bytes:
@@ -293,7 +289,7 @@ class RollCall:
         """Return the agents that have answered the first call since this was asked."""
         present: set[int] = set()
         for message in self._answers():
-            with suppress(Unusable):
+            with suppress(BadMessage):
                 self._accounts.add(message, self._number)
                 present.update(message.agent)
         return present

@@ -14,10 +14,10 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.names import named
-from dtsa_agent.ros.common.process.waiting import Waiting
-from dtsa_agent.ros.common.wire.messages import header_of, time_of
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.messages import header_of, time_of
+from dtsa_agent.ros.common.names import agent_names
+from dtsa_agent.ros.common.runs import WaitingLog
 from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
 
@@ -130,7 +130,7 @@ class Diagnostics(ChannelObserver):
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._ticks = 0
 
-    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         self._counts[verdict.outcome] += 1
 
     def idle(self, status: ChannelStatus) -> None:
@@ -200,7 +200,7 @@ class RunLog(ChannelObserver):
     def __init__(self, node: Node, run_id: int, lockstep: bool) -> None:
         self._logger = node.get_logger()
         self._lockstep = lockstep
-        self._waiting = Waiting(self._logger)
+        self._waiting = WaitingLog(self._logger)
         self._flying = False
         self._slot, self._since_s = -1, time.monotonic()
         self._warned = False  # that the slot is slow
@@ -214,7 +214,7 @@ class RunLog(ChannelObserver):
     def idle(self, status: ChannelStatus) -> None:
         if not self._flying:
             if status.awaited:
-                self._waiting.tell(f"waiting for {named(status.awaited)} to answer")
+                self._waiting.log(f"waiting for {agent_names(status.awaited)} to answer")
         elif self._lockstep:
             self._watch(status)
 
@@ -225,13 +225,13 @@ class RunLog(ChannelObserver):
             self._slot, self._since_s, self._warned = status.slot, now, False
         elif not self._warned and now - self._since_s > _SLOW_S:
             self._warned = True
-            self._logger.warning(f"slot {status.slot}: still waiting for {named(status.awaited)}")
+            self._logger.warning(f"slot {status.slot}: still waiting for {agent_names(status.awaited)}")
 
     def agent_silent(self, agent: int) -> None:
-        self._logger.warning(f"{named([agent])} is lost: it has not been heard of for a while")
+        self._logger.warning(f"{agent_names([agent])} is lost: it has not been heard of for a while")
 
     def agents_back(self, agents: list[int]) -> None:
-        self._logger.info(f"{named(agents)} {'is' if len(agents) == 1 else 'are'} back")
+        self._logger.info(f"{agent_names(agents)} {'is' if len(agents) == 1 else 'are'} back")
 
     def settings_changed(self, change: Change) -> None:
         values = ", ".join(f"{name} = {value}" for name, value in change.values)

@@ -27,15 +27,16 @@ from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.crazyflie.state import Vector, rotate
 from dtsa_agent.keys import authenticator
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, swarm_wide_node
-from dtsa_agent.ros.common.process.loop import Feed, Stop
-from dtsa_agent.ros.common.process.node_process import run_node
-from dtsa_agent.ros.common.process.priority import take_priority
-from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, OnePublisher, Unusable, check_odometry
-from dtsa_agent.ros.common.wire.messages import Fields
+from dtsa_agent.priority import set_realtime
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import OTHER_SENDER, BadMessage, PublisherGuard, check_odometry
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.messages import Fields
+from dtsa_agent.ros.common.node_process import run_node
+from dtsa_agent.ros.common.parameters import check_parameters, declare_settings, swarm_wide_node
 from dtsa_agent.ros.realtime import RealtimeNode
 from dtsa_agent.ros.swarm_host import declare_ids, declare_swarm
+from dtsa_agent.stop import Stop
 
 from .interfaces import STOP_HERE, VelocityWorld
 
@@ -126,14 +127,14 @@ class StationNode(RealtimeNode):
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
         self._stamp = np.zeros(count)  # s, system clock, of that
         self._inputs: list[Feed] = []
-        self._bridges: list[OnePublisher] = []  # who tells where each vehicle is
+        self._bridges: list[PublisherGuard] = []  # who tells where each vehicle is
         self._outputs = []
         self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=self.membership.intake)
         for name in vehicles:
             self._inputs.append(
                 Feed(node, Odometry, f"/{name}/{names.ODOMETRY}", LATEST, intake=self.membership.intake)
             )
-            self._bridges.append(OnePublisher())
+            self._bridges.append(PublisherGuard())
             self._outputs.append(node.create_publisher(VelocityWorld, f"/{name}/cmd_velocity_world", 1))
 
     @property
@@ -158,11 +159,11 @@ class StationNode(RealtimeNode):
     def _check(self, index: int, message: Odometry, feed: Feed) -> None:
         """Whether odometry can be that of a vehicle, and of the bridge that has told of it so far.
 
-        :raises Unusable: if it cannot. Without any for a while the vehicle gets no commands, and the bridge holds it.
+        :raises BadMessage: if it cannot. Without any for a while the vehicle gets no commands, and the bridge holds it.
         """
         check_odometry(message)
         if not self._bridges[index].admits(time.monotonic(), feed.sender):
-            raise Unusable(OTHER_SENDER, f"odometry of {self._names[index]} from two publishers")
+            raise BadMessage(OTHER_SENDER, f"odometry of {self._names[index]} from two publishers")
 
     def _note(self, index: int, message: Odometry) -> None:
         place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
@@ -210,7 +211,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         config = declare_swarm(node)
         ids = declare_ids(node, config.agents)
         station = StationNodeSettings(**declare_settings(node, StationNodeSettings))
-        take_priority(station.priority)
+        set_realtime(station.priority)
         check_parameters(node)
         vehicles = station.vehicles.split() or [f"cf{k}" for k in range(1, config.agents + 1)]
         if len(vehicles) != config.agents:

@@ -29,11 +29,10 @@ from dtsa_agent.crazyflie.positions import PositionSettings
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.settings import load_swarm
 from dtsa_agent.crazyflie.state import State
-from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings
-from dtsa_agent.ros.common.process.loop import Serving
-from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
-from dtsa_agent.ros.common.process.priority import stay_on_one_processor, take_priority
-from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_agent.priority import set_realtime, use_last_processor
+from dtsa_agent.ros.common.loop import ExecutorThread
+from dtsa_agent.ros.common.node_process import follow_supervisor, init_ros, limit_to_machine
+from dtsa_agent.ros.common.parameters import check_parameters, declare_settings
 
 from .interfaces import NODE
 from .preflight import FAIL, preflight
@@ -164,16 +163,16 @@ def run_node(node: BridgeNode) -> int:
     # Several threads a Crazyflie share one interpreter; a command that waits for its turn shall not wait 5 ms.
     sys.setswitchinterval(SWITCH_S)
     level = node.settings.station.priority
-    if level and (problem := take_priority(level)):
+    if level and (problem := set_realtime(level)):
         node.say("warn", f"no real-time priority ({problem}): keep this station free of other work")
     elif level:
-        stay_on_one_processor()
+        use_last_processor()
     problem = node.start(interrupts.any)
     if problem:
         node.say("error", problem)
         node.bridge.close()
         return 1
-    serving = Serving(node.context, "executor", node)
+    serving = ExecutorThread(node.context, "executor", node)
     serving.start()
     node.say("info", "ready; Ctrl-C lands all, a second one stops all motors")
     interrupts.wait()
@@ -189,7 +188,7 @@ def check_node(node: BridgeNode, say: Callable[[str], None]) -> int:
     """
     interrupts = _Interrupts()
     level = node.settings.station.priority
-    problem = take_priority(level) if level else ""
+    problem = set_realtime(level) if level else ""
     if node.positions is not None:
         node.positions.start()
     node.bridge.connect(stop=interrupts.any)

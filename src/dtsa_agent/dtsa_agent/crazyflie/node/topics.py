@@ -31,7 +31,7 @@ from dtsa_agent.crazyflie.positions import NAMED_POSES, PositionSettings, Tracke
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state import State, VehicleState, place_text, rotate_inverse
 from dtsa_agent.crazyflie.vehicle import OFF, Snapshot, Vehicle
-from dtsa_agent.ros.common.wire.packing import UNKNOWN, diagonal
+from dtsa_agent.ros.common.cdr import UNKNOWN, diagonal
 
 from . import interfaces
 from .interfaces import EVENTS, EVENTS_QOS, STATE, TRAJECTORIES

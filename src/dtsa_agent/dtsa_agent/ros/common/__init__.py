@@ -1,1 +1,1 @@
-"""What all nodes share: names on the graph, wire format, loop, parameters, the life of a process."""
+"""The same for all nodes of a swarm: names, parameters, messages and their checks, and the life of a process."""

@@ -24,7 +24,7 @@ from dtsa_agent.crazyflie.controls import shortest_s
 from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS, STATE, STOP_HERE, Arm, GoTo, Land, Takeoff
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state import to_map, to_world
-from dtsa_agent.ros.common.process.loop import Serving
+from dtsa_agent.ros.common.loop import ExecutorThread
 from dtsa_agent.stop import StopToken
 
 from .mission_record import MissionLog
@@ -78,7 +78,7 @@ class Mission:
                 *((GoTo, f"/{robot.name}/go_to") for robot in settings.robots),
             )
         }
-        self._serving = Serving(node.context, "mission", node)
+        self._serving = ExecutorThread(node.context, "mission", node)
         self._pulse = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
     def _keep_status(self, name: str) -> Callable[[Status], None]:

@@ -20,12 +20,11 @@ from dtsa_agent.core.station import check_slotted
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.keys import check_key
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import to_parameters
-from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.process.priority import give_way, leave_that_processor, take_priority
-from dtsa_agent.stop import StopToken
+from dtsa_agent.priority import avoid_last_processor, set_ordinary_thread, set_realtime
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.node_process import init_ros
+from dtsa_agent.ros.common.parameters import to_parameters
+from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.flights.children import Children, NodeError, describe_end
 from dtsa_bench.flights.domain import LAST_DOMAIN, ros_domain
 from dtsa_bench.flights.flight import END_S, QUIET, Flight, run_environment
@@ -105,17 +104,17 @@ class _Station:
 
         :returns: the run with these places, the mission.
         """
-        leave_that_processor()
+        avoid_last_processor()
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
         mission = self._mission = Mission(node, self.settings, scenario, ended, self.progress.show)
         mission.bridge_alive = mission.check_bridge if self._attach else self.bridge.check
         mission.start()
-        take_priority(below(self.settings.station.priority, 1))
+        set_realtime(below(self.settings.station.priority, 1))
         mission.connect()
         swarm = mission.find_places(run.swarm)
         if swarm != run.swarm:
-            self.progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
+            self.progress.print_line(f"not where they would begin: exchange of roles, places {swarm.places}")
             run = dataclasses.replace(run, swarm=swarm)
         self.progress.show("agents")
         self._start_agents(run)
@@ -154,7 +153,7 @@ class _Station:
                 end_process(self._recorder.all[0].process, RECORDER_END_S)
                 bag = self._directory / MISSION_BAG
                 if not (bag / "metadata.yaml").is_file():
-                    self.progress.say(
+                    self.progress.print_line(
                         f"the recorder did not close {bag}: `{program()} recover {bag}` saves what it holds"
                     )
                 if mission is not None:
@@ -245,7 +244,7 @@ def _exchange(
         assert isinstance(channel, RealtimeChannel)
         shown = FlightProgress(progress, measurement, channel)
         watch = MissionWatch(mission, channel, measurement.metrics if stop_on_crash else None)
-        channel.observe(watch, RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
+        channel.observe(watch, RealtimeSupervisor(agents, channel, measurement, progress.print_line), shown)
         try:
             channel.run(watch)
             ended.reason = ended.reason or channel.fell_behind
@@ -263,7 +262,7 @@ def _exchange(
                 mission.order_landing()  # before the agents end: nobody flies on without them
             agents.stop()
             mission.land(urgent)
-        give_way()  # the bridge does not: it has to watch them
+        set_ordinary_thread()  # the bridge does not: it has to watch them
         pictures = options.pictures and not ended
         summary = flight.write_results(
             pictures,

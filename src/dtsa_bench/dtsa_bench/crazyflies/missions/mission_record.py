@@ -27,8 +27,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS
-from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
-from dtsa_agent.ros.common.process.priority import give_way_by
+from dtsa_agent.priority import set_nice
+from dtsa_agent.ros.common.node_process import follow_supervisor, init_ros
 from dtsa_bench.log.bag.writer import BagWriter
 
 MISSION_BAG = "mission_bag"  # the whole mission's bag, beside that of the exchange
@@ -178,7 +178,7 @@ def main(argv: list[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: over.append(number))
     follow_supervisor()
-    give_way_by(NICE)
+    set_nice(NICE)
     init_ros(QUIET)
     node = rclpy.create_node("mission_recorder", enable_rosout=False, start_parameter_services=False)
     try:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import dtsa_agent
-from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
@@ -45,7 +45,7 @@ class _Flight:
     def __init__(self, agent: int, config: SwarmConfig, path: Path) -> None:
         self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _P2P(), not config.targets_known)
         self._record: SlotRecord | None = None
-        self._before: list[Heard] = []
+        self._before: list[ReceivedFrame] = []
         self._slots = config.steps
 
     def note(self, data: bytes) -> None:
@@ -61,18 +61,18 @@ class _Flight:
             self.close_slot()
             self._before.clear()
         else:
-            heard = Heard(sender, slot, at_ns, frame[:length], bool(accepted))
+            heard = ReceivedFrame(sender, slot, at_ns, frame[:length], bool(accepted))
             (self._before if self._record is None else self._record.heard).append(heard)
 
     def _open(self, data: bytes) -> None:
-        _, anew, reason, length, slot, start, opened, present, chosen, digest, score, *rest = _OPENED.unpack(data)
+        _, is_first, reason, length, slot, start, opened, present, chosen, digest, score, *rest = _OPENED.unpack(data)
         self.close_slot()
         position, velocity, command, goal = (np.array(rest[3 * i : 3 * i + 3]) for i in range(4))
         frame, before = rest[12][:length], self._before
         self._before = []
         track = np.repeat(position[None], self._slots, axis=0)
         self._record = SlotRecord(
-            slot, start, opened, bool(anew), present, chosen, reason, digest, score, track, velocity, command, goal,
+            slot, start, opened, bool(is_first), present, chosen, reason, digest, score, track, velocity, command, goal,
             frame, before=before,
         )  # fmt: skip
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.process.priority import take_priority
+from dtsa_agent.priority import set_realtime
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
 from dtsa_bench.crazyflies.simulated.radio.side import Dongles
 from dtsa_bench.runs.options import add_options, given, whole_number
@@ -140,14 +140,14 @@ def run(args: argparse.Namespace) -> int:
         request_fault(args)
         return 0
     if "DTSA_SUPERVISOR" in os.environ:  # the bridge started this fleet for itself, and has rclpy
-        from dtsa_agent.ros.common.process.node_process import follow_supervisor
+        from dtsa_agent.ros.common.node_process import follow_supervisor
 
         follow_supervisor()
     priority = whole_number(args.priority, "priority", 0, 90)
     if args.dongles_only:
         return _run_dongles(args, priority)
     fleet = Fleet(fleet_config(args))
-    take_priority(priority)
+    set_realtime(priority)
     _end_by_signals(fleet.stop, args.ignore_interrupt)
     for uri in fleet.config.uris:
         print(uri)
@@ -177,7 +177,7 @@ def _run_dongles(args: argparse.Namespace, priority: int) -> int:
         raise ConfigError("dongles_only", True, "with --simulated-radio SOCKET, and without --config")
     settings = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
     dongles = Dongles(settings)
-    take_priority(priority)
+    set_realtime(priority)
     _end_by_signals(dongles.stop, args.ignore_interrupt)
     print(f"{settings.dongles} simulated Crazyradios at {settings.path}; Ctrl-C ends", flush=True)
     dongles.run()

@@ -13,8 +13,8 @@ from itertools import repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
-from dtsa_agent.ros.common.wire.packing import POSE_COVARIANCE, TWIST_COVARIANCE
+from dtsa_agent.ros.common.cdr import REPRESENTATION, SECOND
+from dtsa_agent.ros.common.cdr import POSE_COVARIANCE, TWIST_COVARIANCE
 from dtsa_bench.drawing import palette
 
 STAMP = struct.Struct("<iI")
@@ -67,7 +67,7 @@ class OdometryPacker:
 
     The orientation is the identity, so that the axes of the child frame are those of the frame: the
     twist, which Odometry gives in the child frame (REP-103, REP-147), holds the velocity in the frame as
-    it is. Covariances do not claim certainty: see dtsa_agent.ros.common.wire.packing.
+    it is. Covariances do not claim certainty: see dtsa_agent.ros.common.cdr.
     """
 
     def __init__(self, child_frames: Sequence[str], frame: str = "map") -> None:

@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.wire.cdr import SECOND
+from dtsa_agent.ros.common.cdr import SECOND
 
 from . import schema
 from .errors import BagError

@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 from mcap.writer import CompressionType, Writer
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.wire.packing import RUN_MESSAGES, without_run
+from dtsa_agent.ros.common.cdr import RUN_MESSAGES, without_run
 from dtsa_bench import __version__
 from dtsa_bench.runs.program import program
 

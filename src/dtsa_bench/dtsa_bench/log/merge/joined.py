@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.datagram import flight_ns, frame_in
+from dtsa_agent.air.port import flight_ns, frame_in
 from dtsa_agent.air.port import PortProperties
-from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.core import Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.core.plugins.entry_points import make_swarm
@@ -70,7 +70,7 @@ class ProcessReplay:
 
     def step(self, record: SlotRecord) -> None:
         """One slot; the frame of an agent that was too late to send is made again."""
-        presence = np.array([record.present | (NEW if record.anew else 0)], np.uint8)
+        presence = np.array([record.present | (NEW if record.is_first else 0)], np.uint8)
         vectors = [vector.reshape(3, 1) for vector in (record.velocity, record.command, record.goal)]
         state = AgentState(record.track[:, :, None], *vectors, presence)
         self._replay.decide(record.slot, state, self._heard(record.before))
@@ -82,7 +82,7 @@ class ProcessReplay:
         for name in _KEPT:
             getattr(tables, name)[row] = getattr(self.swarm, name)[0]
 
-    def _heard(self, frames: Sequence[Heard]) -> list[HeardBy]:
+    def _heard(self, frames: Sequence[ReceivedFrame]) -> list[HeardBy]:
         return [HeardBy(heard.slot, frame_in(heard.datagram, self._config), None) for heard in frames]
 
     def _compare(self, record: SlotRecord) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dtsa_agent.air.datagram import frame_in
+from dtsa_agent.air.port import frame_in
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.rules import Judge

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.air.datagram import NETWORK
-from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.port import NETWORK
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.log.ages import Ages, ObservedPairs
 from dtsa_bench.log.arrays import NEW, PRESENT, FlightArrays
@@ -117,10 +117,10 @@ def _slots_of(log: FlightArrays, agent: int, first: int, last: int) -> Iterator[
         data = log.frame(row, agent)
         at = int(log.start_ns[row] + log.offset_ns[row, column])
         presence = PRESENT if log.presence is None else int(log.presence[row, column])
-        taken_in: tuple[list[Heard], list[Heard]] = [], []
+        taken_in: tuple[list[ReceivedFrame], list[ReceivedFrame]] = [], []
         if heard is not None:
             for k in entries.get(row, []):
-                one = Heard(int(heard.sender[k]), int(heard.slot[k]), int(heard.time_ns[k]), heard.data[k], True)
+                one = ReceivedFrame(int(heard.sender[k]), int(heard.slot[k]), int(heard.time_ns[k]), heard.data[k], True)
                 taken_in[0 if heard.before[k] else 1].append(one)
         yield SlotRecord(
             row + log.first_slot, at, at, bool(presence & NEW), presence & ~NEW, int(log.chosen[row, column]),

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import RUN_MESSAGES
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import RUN_MESSAGES
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.cdr import OdometryPacker
 from dtsa_bench.log.bag.metadata import RUN_ID

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.delays import Delays
-from dtsa_agent.ros.common.graph.names import named
+from dtsa_agent.ros.common.names import agent_names
 from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
 
 from dtsa_bench.log.arrays import FlightArrays, HeardFrames
@@ -61,7 +61,7 @@ class _RecordedMedium:
     def advance(self, slot: int) -> None:
         pass
 
-    def judge(self, slot: int, frame: OnAir, others: Any, positions: Any = None) -> Reception:
+    def resolve(self, slot: int, frame: OnAir, others: Any, positions: Any = None) -> Reception:
         return Reception(self._next[frame.sender].popleft(), 0, 0)
 
 
@@ -187,7 +187,7 @@ class FramesOnAir:
             while waiting and waiting[0][1].asked_ns < at:
                 key, sent = waiting.popleft()
                 air.begin(key, sent.sender, sent.asked_ns, len(sent.data))
-            yield from air.settle(at)
+            yield from air.resolve(at)
 
     def _by_slots(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
         slots: dict[int, list[SentFrame]] = {}
@@ -256,4 +256,4 @@ class FramesOnAir:
 
 
 def _ids(mask: Mask) -> str:
-    return named((np.flatnonzero(mask) + 1).tolist())
+    return agent_names((np.flatnonzero(mask) + 1).tolist())

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, SwarmConfig
-from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.stop import Stop
 from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.flight import Flight, fly
 from dtsa_bench.flights.options import FlightOptions
@@ -144,7 +144,7 @@ class KillAgent(ChannelObserver):
         """The flight's processes are started."""
         self._children = children
 
-    def begun(self, at_s: float) -> None:
+    def start_known(self, at_s: float) -> None:
         self._begin_s = at_s
 
     def idle(self, status: ChannelStatus) -> None:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Swarm, make_scenario
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import split_frames, unpack_received
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.hearing import Hearing, Unheard
 from dtsa_bench.runs.metrics import metrics_tables

@@ -25,11 +25,10 @@ from std_srvs.srv import Empty
 from visualization_msgs.msg import MarkerArray
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.process.loop import Feed
-from dtsa_agent.ros.common.process.node_process import init_ros
-from dtsa_agent.ros.common.wire.checks import Intake
-from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import Intake
+from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
 
 from .follower import Follower
 from .history import RunHistory, VehicleStates

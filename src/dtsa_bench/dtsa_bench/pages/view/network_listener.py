@@ -10,9 +10,7 @@ from collections import Counter, deque
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.datagram import frame_in, link_of
-from dtsa_agent.air.port import PortSettings
-from dtsa_agent.air.ports import open_listener
+from dtsa_agent.air.port import PortSettings, frame_in, link_of, open_port
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import decode_extended
@@ -174,7 +172,7 @@ class NetworkListener:
         link = link_of(config, port.properties)
         self._datagrams = StationSettings(config, link, authenticator(config))
         self._flight_ns, self._too_long_ns = link.flight_ns, self._datagrams.too_long_ns
-        self._listener = open_listener(port)
+        self._listener = open_port(port)
         self._run: ListenedRun | None = None
         self.refused: Counter[str] = Counter()  # datagrams that were not accepted, by reason
         self.stopped = False

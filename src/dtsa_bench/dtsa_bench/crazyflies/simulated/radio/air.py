@@ -68,5 +68,5 @@ class RadioAir:
         """Ids of the radios that can decode a transmission that has ended, if they listen."""
         self._judged += 1
         others = [f for f in self._by_channel[channel] if f is not frame and f.end_ns > frame.start_ns]
-        received = self._medium.judge(self._judged, frame, others).received
+        received = self._medium.resolve(self._judged, frame, others).received
         return {int(index) + 1 for index in received.nonzero()[0]}

@@ -1,0 +1,178 @@
+"""A multicast group on one network interface as the port of an agent, with the kernel's times of arrival."""
+
+from __future__ import annotations
+
+import fcntl
+import socket
+import struct
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import NamedTuple
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.kernel import ffi, lib
+from dtsa_agent.core.station import Station
+
+from .port import ClockMap, ReceivedDatagram
+from .settings import UdpSettings
+
+_SIOCGIFADDR = 0x8915
+_IP_RECVERR = 11
+_IP_MULTICAST_ALL = 49  # Linux: 0: only groups that this socket has joined
+_SO_TIMESTAMPNS = 35
+_CHECK_NS = 1_000_000_000  # from one check whether the interface is still the same to the next
+
+
+class InterfaceState(NamedTuple):
+    """An interface now: both change when it is made anew or gets another address."""
+
+    number: int  # that the kernel gives the interface
+    address: str  # IPv4
+
+
+class UdpPort:
+    """Sends to a group and hears what others send to it. A context manager.
+
+    Datagrams of other groups and interfaces do not get in. What it sends comes back to it, marked as its own: other
+    agents on this computer hear it in the same way. When the interface is made anew, or gets another address, the group
+    is joined again: at a send that the network refuses, and for those that only listen within a second.
+
+    :raises ConfigError: if the interface cannot be used.
+    """
+
+    def __init__(self, settings: UdpSettings) -> None:
+        self._settings, self._group, self.properties = settings, settings.address, settings.properties
+        group, port = self._group
+        state = _state_of(settings)
+        self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._reader = ffi.new("socket_reader *")
+        lib.socket_start(self._reader, self._in.fileno())
+        self.interface_changes = 0  # how often the group was joined again
+        self.log: Callable[[str], None] | None = None
+        self._state: InterfaceState | None = None  # by which the group is joined; None: the interface has gone
+        self._membership = b""
+        self._check_due_ns = time.monotonic_ns() + _CHECK_NS
+        try:
+            self._in.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._in.bind(self._group)
+            self._in.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+            with suppress(OSError):  # arrivals are then as exact as this process is quick
+                self._in.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            self._in.setblocking(False)
+            self._join(state)
+        except OSError as error:
+            self.close()
+            where = f"{settings.interface}, group {group}:{port}"
+            raise ConfigError("interface", where, f"one that takes part in the group ({error.strerror})") from None
+
+    def _join(self, state: InterfaceState) -> None:
+        """Join the group, and send to it, by an interface as it is now."""
+        membership = struct.pack("=4s4si", socket.inet_aton(self._group[0]), b"\0\0\0\0", state.number)
+        out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # a bound socket cannot get another address
+        try:
+            out.bind((state.address, 0))
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, membership)
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, self._settings.ttl)
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+            out.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)  # else Linux drops, at a full queue, in silence
+            out.setblocking(False)
+            if self._membership:  # of an interface that has gone, maybe: the socket still has it
+                with suppress(OSError):
+                    self._in.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, self._membership)
+            self._in.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        except OSError:
+            out.close()
+            raise
+        self._out.close()
+        self._out, self._membership, self._state = out, membership, state
+        address, number = out.getsockname()  # from which it sends
+        self._reader.address, self._reader.port = socket.inet_aton(address), number
+
+    def check_interface(self) -> bool:
+        """Join the group again if the interface is another one than before; return whether that was so."""
+        try:
+            state = _state_of(self._settings)
+        except ConfigError:
+            if self._state is not None:
+                self._print("has gone, or has no address: no frame leaves or arrives until it is back")
+            self._state = None
+            return False
+        if state == self._state:
+            return False
+        try:
+            self._join(state)
+        except OSError:  # it is not ready yet
+            return False
+        self.interface_changes += 1
+        self._print(f"is another one now (number {state.number}, address {state.address}): joined the group again")
+        return True
+
+    def _print(self, text: str) -> None:
+        if self.log is not None:
+            self.log(f"interface {self._settings.interface} {text}")
+
+    def fileno(self) -> int:
+        """For ``select``: readable when something has arrived."""
+        return self._in.fileno()
+
+    def send(self, data: bytes) -> str:
+        """Send to the group at once; return why the network has refused it, or an empty text."""
+        refusal = self._send(data)
+        return self._send(data) if refusal and self.check_interface() else refusal
+
+    def _send(self, data: bytes) -> str:
+        try:
+            self._out.sendto(data, self._group)
+        except OSError as error:  # the interface is down for a while, or its queue is full
+            return error.strerror or type(error).__name__
+        return ""
+
+    def receive(self, most: int) -> list[ReceivedDatagram]:
+        """Return what has arrived, in this order; empty if nothing has."""
+        self._check_in_time()
+        datagrams = (self._reader.datagrams[k] for k in range(lib.socket_read(self._reader, most)))
+        return [ReceivedDatagram(bytes(ffi.buffer(d.data, d.length)), d.arrival_ns, bool(d.own)) for d in datagrams]
+
+    def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
+        """Hand what others have sent to a station; return how many datagrams have arrived, at most so many."""
+        self._check_in_time()
+        count: int = lib.socket_deliver(self._reader, most, station.c, clock.offset_ns, clock.drift_ppb, clock.began_ns)
+        station.raise_fault()
+        return count
+
+    def _check_in_time(self) -> None:
+        now = time.monotonic_ns()
+        if now >= self._check_due_ns:
+            self._check_due_ns = now + _CHECK_NS
+            self.check_interface()
+
+    def counts(self) -> dict[str, int]:
+        """Return failed reads, how often the clock has been set, and how often the interface was another one."""
+        return {
+            "unreadable": self._reader.unreadable,
+            "clock_steps": self._reader.clock_steps,
+            "interface_changes": self.interface_changes,
+        }
+
+    def close(self) -> None:
+        """Leave the group."""
+        self._in.close()
+        self._out.close()
+
+    def __enter__(self) -> UdpPort:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.close()
+
+
+def _state_of(settings: UdpSettings) -> InterfaceState:
+    name, number = settings.interface, settings.interface_index()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as query:
+        try:
+            answer = fcntl.ioctl(query, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+        except OSError:
+            raise ConfigError("interface", name, "one with an IPv4 address") from None
+    return InterfaceState(number, socket.inet_ntoa(answer[20:24]))

@@ -1,0 +1,201 @@
+"""Checks of what comes in over the graph: one function a message type; what is not received is counted by reason.
+
+A check raises :class:`BadMessage` with one of the reasons below; nothing else about the message may be believed then.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from dtsa_msgs.msg import Process, Slot
+from nav_msgs.msg import Odometry
+
+from dtsa_agent.core.errors import RemoteProtocolError
+from dtsa_agent.core.swarm import FRAME_MAX
+
+from . import names
+
+UNREADABLE = "unreadable"  # not a message of its topic's type
+OTHER_RUN = "other run"
+OTHER_SENDER = "other sender"  # not of the publisher, or the process, that has sent so far
+UNKNOWN = "unknown agent"
+SIZES = "sizes"  # arrays that do not fit together
+RANGE = "range"  # numbers that cannot be
+SLOT = "slot"  # of a slot that cannot be under way
+FORGED_END = "forged end"
+REASONS = (UNREADABLE, OTHER_RUN, OTHER_SENDER, UNKNOWN, SIZES, RANGE, SLOT, FORGED_END)
+
+LARGEST_SLOT = names.FIRST_CALL - 1  # 248 days of 10 ms slots
+FARTHEST_M = 1e6  # no vehicle is farther from the room's centre, or faster, than this many m or m/s
+FARTHEST_ODOMETRY_M, FASTEST_ODOMETRY_MPS = 1000.0, 100.0  # of vehicles that really fly
+_SILENT_S = 0.3  # after such a silence another publisher may take over
+_LONGEST_TEXT, _LONGEST_NAME, _LONGEST_LINE = 65536, 200, 300  # characters
+_MOST_REASONS = 64
+_LOG_S = 5.0  # from one line in the log to the next
+
+
+class BadMessage(RemoteProtocolError):
+    """A message that is not received, for one of :data:`REASONS`; the text says what is wrong with it."""
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(detail)
+        self.reason = reason
+
+
+class Intake:
+    """Counts messages that were not received, by reason, and logs it now and then if there is a logger."""
+
+    def __init__(self, logger: Any = None) -> None:
+        self._logger = logger
+        self._next_line_s = 0.0
+        self.counts: dict[str, int] = {}  # by reason
+
+    @property
+    def total(self) -> int:
+        """Number of all messages dropped."""
+        return sum(self.counts.values())
+
+    def drop(self, reason: str, detail: str) -> None:
+        """Count a message."""
+        self.counts[reason] = self.counts.get(reason, 0) + 1
+        now = time.monotonic()
+        if self._logger is not None and now >= self._next_line_s:
+            self._next_line_s = now + _LOG_S
+            self._logger.warning(f"not taken in ({reason}): {detail}; {self.total} so far"[:_LONGEST_LINE])
+
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Drop and count what is :class:`BadMessage` within."""
+        try:
+            yield
+        except BadMessage as error:
+            self.drop(error.reason, str(error))
+
+
+def add_counts(total: dict[str, int], more: Mapping[str, int]) -> None:
+    """Add counts by reason to a total."""
+    for reason, count in more.items():
+        total[reason] = total.get(reason, 0) + count
+
+
+class PublisherGuard:
+    """Admits the messages of one publisher: of a given sender, or of the first one until it has been silent.
+
+    Where a middleware does not name senders this is off.
+    """
+
+    __slots__ = ("_only", "_sender", "_time_s")
+
+    def __init__(self, sender: bytes | None = None) -> None:
+        self._only = self._sender = sender
+        self._time_s = 0.0
+
+    def admits(self, now_s: float, sender: bytes | None) -> bool:
+        """Return whether a message may be the next one of the publisher (``now_s``: s, monotonic)."""
+        if sender is None:
+            return True
+        if sender != self._sender and (self._only is not None or now_s - self._time_s < _SILENT_S):
+            return False
+        self._sender, self._time_s = sender, now_s
+        return True
+
+
+def check_slot(message: Any, agents: int) -> None:
+    """Check that the fields of a dtsa_msgs/Slot fit together, for N agents."""
+    phase, senders, lengths, received = message.phase, message.sender, message.length, message.received
+    count = len(senders)
+    if phase > Slot.REFUSE:
+        raise BadMessage(RANGE, f"slot message of phase {phase}")
+    if (message.slot > LARGEST_SLOT and phase != Slot.PREPARE) or message.heard_slot > LARGEST_SLOT:
+        raise BadMessage(SLOT, f"slot message for slot {message.slot}")
+    if phase != Slot.RUN:
+        if count or len(lengths) or len(received):
+            raise BadMessage(SIZES, f"slot message of phase {phase} with frames")
+        return
+    if count == 0:
+        if len(lengths) or len(message.data) or len(received):
+            raise BadMessage(SIZES, "slot message with frames of nobody")
+        return
+    if len(lengths) != count or len(received) != count * ((agents + 7) // 8):
+        detail = f"{count} senders, {len(lengths)} lengths, {len(received)} bytes of receivers"
+        raise BadMessage(SIZES, f"slot message: {detail}")
+    check_frames(lengths, message.data)
+    if not all(lengths):
+        raise BadMessage(SIZES, "slot message with an empty frame")
+    check_ids(senders, agents, ascending=False)
+
+
+def check_frames(lengths: Sequence[int], data: Any) -> None:
+    """Check that frames are as long as the air carries, and as the bytes that are there."""
+    if sum(lengths) != len(data):
+        raise BadMessage(SIZES, f"{len(data)} bytes of frames, {sum(lengths)} in their lengths")
+    if len(lengths) and max(lengths) > FRAME_MAX:
+        raise BadMessage(SIZES, f"a frame of {max(lengths)} bytes; the air carries {FRAME_MAX}")
+
+
+def check_ids(ids: Sequence[int], agents: int, ascending: bool = True) -> None:
+    """Check that ids are those of different agents of N, one at least, and in order if they have to be."""
+    count = len(ids)
+    if not count or count > agents or min(ids) < 1 or max(ids) > agents:
+        raise BadMessage(UNKNOWN, f"a message for agents {list(ids[:8])}; allowed: 1 to {agents}")
+    if count > 1 and (len(set(ids)) != count or (ascending and any(a >= b for a, b in itertools.pairwise(ids)))):
+        raise BadMessage(UNKNOWN, f"a message for agents {list(ids[:8])}, twice or out of order")
+
+
+def check_numbers(name: str, values: Iterable[float], largest: float = FARTHEST_M) -> None:
+    """Check that numbers are finite and not beyond a magnitude."""
+    for value in values:
+        if not math.isfinite(value):
+            raise BadMessage(RANGE, f"{name} that are no numbers")
+        if abs(value) > largest:
+            raise BadMessage(RANGE, f"{name} beyond {largest:g}")
+
+
+def check_start(start_ns: int, now_ns: int, early_ns: int = 10_000_000_000, late_ns: int = 60_000_000_000) -> None:
+    """Check that a transmission that starts then can be under way: clocks are off, but not by more than these limits.
+
+    Times are ns on the channel's time line.
+    """
+    if not now_ns - late_ns <= start_ns <= now_ns + early_ns:
+        raise BadMessage(SLOT, f"a transmission that starts {(start_ns - now_ns) / 1e9:.3g} s from now")
+
+
+def check_process(message: Process, agents: int) -> None:
+    """Check what a process says about itself, in a swarm of N agents."""
+    check_ids(message.agent, agents)
+    if len(message.dropped_reason) != len(message.dropped) or len(message.dropped) > _MOST_REASONS:
+        raise BadMessage(SIZES, f"{len(message.dropped)} counts for {len(message.dropped_reason)} reasons")
+    if len(message.settings) > _LONGEST_TEXT or any(len(reason) > 64 for reason in message.dropped_reason):
+        raise BadMessage(SIZES, f"{len(message.settings)} characters of settings")
+
+
+def check_odometry(message: Odometry) -> None:
+    """Check that a vehicle of a swarm can have the position, attitude and velocity of a message."""
+    place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
+    check_numbers("places", (place.x, place.y, place.z), FARTHEST_ODOMETRY_M)
+    check_numbers("velocities", (speed.x, speed.y, speed.z), FASTEST_ODOMETRY_MPS)
+    check_numbers("attitudes", (q.x, q.y, q.z, q.w))
+    if not 0.9 < math.hypot(q.x, q.y, q.z, q.w) < 1.1:
+        raise BadMessage(RANGE, "attitudes that are no unit quaternions")
+
+
+def parse_json(data: bytes | str) -> Any:
+    """Return what a text of JSON holds.
+
+    :raises ValueError: for any other text, one too deep included.
+    """
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise ValueError("a text that is nested too deeply") from None
+
+
+def plain(text: str) -> str:
+    """Return a text from outside as it can stand in one line."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text[:_LONGEST_NAME])

@@ -1,1 +1,0 @@
-"""The life of a node's process: start, loop, priority, peers, waiting, end."""

@@ -1,1 +1,0 @@
-"""Messages as bytes and arrays, and the checks of what comes in."""
