@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Rooms that are checked, below the root.
-ROOMS = (
-    "src/dtsa_agent/dtsa_agent/core/", "src/dtsa_bench/dtsa/", "src/dtsa_bench/dtsa_bench/commands/",
-    "src/dtsa_bench/dtsa_bench/experiments/", "tools/",
+#: Rooms that are not checked yet, below the root.
+NOT_YET = (
+    "src/dtsa_agent/dtsa_agent/crazyflie/", "src/dtsa_bench/launch/", "src/dtsa_bench/dtsa_bench/crazyflies/",
+    "src/dtsa_bench/dtsa_bench/drawing/", "src/dtsa_bench/dtsa_bench/log/", "src/dtsa_bench/dtsa_bench/pages/",
+    "src/dtsa_bench/dtsa_bench/runs/", "src/dtsa_bench/dtsa_bench/simulation/",
 )  # fmt: skip
 #: Words that no name may have: why not, and what to write instead.
 BANNED = {
@@ -46,8 +47,8 @@ BANNED = {
         ("a participle leaves out what it is said of", "a noun of the field with its role"),
     ),
 }
-#: The same for names of classes alone: functions may be called after what they return.
-BANNED_IN_CLASSES = {
+#: What no class may end with: its last word is the noun.
+BANNED_AS_NOUNS = {
     **dict.fromkeys(
         ("heard", "sent", "given", "made", "found", "known", "kept", "gone"),
         ("a participle leaves out what it is said of", "a noun of the field with its role"),
@@ -66,16 +67,16 @@ MAY_BE_SMALL = {
     "kernel.py",  # the binding alone: everything in the core imports it
     "delays.py",  # four rooms count delays
     "env.py",  # a public module of its own
+    "keys.py",  # the one place that reads the secret
+    "verdict.py",  # what channel, nodes and bench share
 }  # fmt: skip
 MOST_FILES = 12  # of a package
 
 
 def modules() -> list[Path]:
     listed = subprocess.run(["git", "ls-files", "*.py"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    paths = [
-        path for path in listed.split() if path.startswith(ROOMS) and not {"test", "golden"} & set(path.split("/"))
-    ]
-    return [Path(path) for path in paths]
+    paths = [path for path in listed.split() if path.startswith(("src/", "tools/")) and not path.startswith(NOT_YET)]
+    return [Path(path) for path in paths if not {"test", "golden"} & set(path.split("/"))]
 
 
 def tokens(name: str) -> list[str]:
@@ -98,7 +99,9 @@ def test_names_are_plain() -> None:
         faults += [f"{path}: {fault}" for fault in wrong(path.stem, BANNED)]
         for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
             if isinstance(node, ast.ClassDef):
-                faults += [f"{path}: {node.name}: {fault}" for fault in wrong(node.name, BANNED | BANNED_IN_CLASSES)]
+                faults += [f"{path}: {node.name}: {fault}" for fault in wrong(node.name, BANNED)]
+                noun = tokens(node.name)[-1]
+                faults += [f"{path}: {node.name}: {fault}" for fault in wrong(noun, BANNED_AS_NOUNS)]
             elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.name not in FOREIGN:
                 faults += [f"{path}: {node.name}: {fault}" for fault in wrong(node.name, BANNED)]
     assert not faults, "\n".join(faults)

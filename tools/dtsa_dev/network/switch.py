@@ -36,7 +36,7 @@ _FLOOD = 20  # frames at a time, now and then
 
 
 @dataclass(frozen=True, slots=True)
-class OnAir:
+class CarriedDatagram:
     """A datagram that was on the air."""
 
     start_ns: int  # since the switch began
@@ -76,7 +76,7 @@ class Switch:
         self._due: list[tuple[int, int, int, bytes]] = []  # deliveries: when, number, cable, Ethernet frame: a heap
         self._count = 0
         self._zero = time.monotonic_ns()
-        self.log: list[OnAir] = []
+        self.log: list[CarriedDatagram] = []
         #: Is told each Ethernet frame that has left the air.
         self.listener: Callable[[bytes], None] | None = None
         self.left_out = 0  # Ethernet frames that were nothing for the air
@@ -145,7 +145,7 @@ class Switch:
                     entry = (verdict.arrival_ns + delay, self._count, self._cables[number], frame)
                     heapq.heappush(self._due, entry)
             self.log.append(
-                OnAir(
+                CarriedDatagram(
                     verdict.start_ns, verdict.end_ns, verdict.sender, agent, slot, len(numbers), verdict.lost,
                     verdict.collided,
                 )
