@@ -57,7 +57,16 @@ class RunSettings(TypedDict, total=False):
     policy: str
     r_min: float
     radio: Literal[
-        "plain", "crazyflie", "sik-64k", "sik-125k", "sik-250k", "e22-62k", "e22-38k", "e22-19k", "xbee", "esp-now"
+        "plain",
+        "crazyflie",
+        "sik-64k",
+        "sik-125k",
+        "sik-250k",
+        "e22-62k",
+        "e22-38k",
+        "e22-19k",
+        "xbee",
+        "esp-now",
     ]
     ramp_up_ns: int
     range_m: float
