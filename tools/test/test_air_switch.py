@@ -24,8 +24,8 @@ import dtsa
 from dtsa_agent.air.port import link_of
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.station import StationSettings
-from dtsa_bench.log.merge.merge import Merge, verified
-from dtsa_bench.log.merged_bag import align, write_merged
+from dtsa_bench.log.merge.merge import Merge, is_verified
+from dtsa_bench.log.merged_bag import write_merged
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_channel_sim import ChannelConfig
 
@@ -145,18 +145,18 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
         flight.carry(0.5)
         flight.end()
         merged = Merge(flight.bags())
-        found = merged.judge()
+        found = merged.summary()
     assert os.readlink("/proc/self/ns/net") == home
     assert found["broken_off"] == ["cf2"]
     assert (found["bags"], found["missing"], found["not_on_the_time_line"]) == (5, [], [])
-    assert verified(found), found["decisions_again"]
+    assert is_verified(found), found["decisions_again"]
     assert found["slots_with_two_senders"] == 0
     assert found["flight"] is not None
     assert stranger.sent_count > 10
     refused = {reason for counts in found["not_taken_in"].values() for reason in counts}
     assert {"other time", "repeated", "rejected"} <= refused
     whole = tmp_path / "whole"
-    write_merged(whole, align(merged, found), found)
+    write_merged(whole, merged.log, found)
     assert verify_bag(whole).to_dict()["difference"] is None
     run = dtsa.open(whole)
     assert run.summary == found["flight"]

@@ -12,11 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Rooms that are not checked yet, below the root.
-NOT_YET = (
-    "src/dtsa_agent/dtsa_agent/crazyflie/", "src/dtsa_bench/launch/", "src/dtsa_bench/dtsa_bench/crazyflies/",
-    "src/dtsa_bench/dtsa_bench/drawing/", "src/dtsa_bench/dtsa_bench/log/", "src/dtsa_bench/dtsa_bench/pages/",
-    "src/dtsa_bench/dtsa_bench/runs/", "src/dtsa_bench/dtsa_bench/simulation/",
-)  # fmt: skip
+NOT_YET = ("src/dtsa_agent/dtsa_agent/crazyflie/", "src/dtsa_bench/launch/", "src/dtsa_bench/dtsa_bench/crazyflies/")
 #: Words that no name may have: why not, and what to write instead.
 BANNED = {
     "say": ("a radio does not speak", "send, announce; to a user: print, log, report"),

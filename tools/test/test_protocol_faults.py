@@ -12,7 +12,7 @@ from dtsa_dev.protocol.experiment import Experiment, FlightEvent, random_schedul
 
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.frame import ExtendedFrame, encode_extended
-from dtsa_bench.log.rules import Judge, Ledger
+from dtsa_bench.log.rules import GrantLedger, RuleChecker
 from dtsa_bench.log.verify.result import Mismatch, Result
 from dtsa_channel_sim import ChannelConfig
 
@@ -119,10 +119,10 @@ def test_the_ledger_sees_broken_rules() -> None:
     def frame(sender: int, slot: int, leases: bytes = b"") -> bytes:
         return encode_extended(ExtendedFrame(Frame(sender, slot, 1, zero, zero, zero), leases=leases))
 
-    def judged(slots: dict[int, dict[int, bytes]]) -> Ledger:
-        ledger = Ledger(4, 5)
+    def judged(slots: dict[int, dict[int, bytes]]) -> GrantLedger:
+        ledger = GrantLedger(4, 5)
         for slot, frames in slots.items():
-            ledger.slot(slot, frames)
+            ledger.check_slot(slot, frames)
         return ledger
 
     assert judged({0: {1: frame(1, 0)}, 1: {2: frame(2, 1)}}).broken == []
@@ -137,15 +137,15 @@ def test_the_ledger_sees_broken_rules() -> None:
     assert "a second time" in judged(again).broken[0]
     opened = judged({4: {1: frame(1, 4, b"\xff" + bytes(10))}, 8: {2: frame(2, 8), 3: frame(3, 8)}})
     assert (opened.broken, opened.open_collisions) == ([], 1)
-    book = Ledger(3, 3)
+    book = GrantLedger(3, 3)
     own = Frame(1, 3, 1, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
-    book.read(3, 1, encode_extended(ExtendedFrame(own, c_s=1, probation=True)))
+    book.note_frame(3, 1, encode_extended(ExtendedFrame(own, c_s=1, probation=True)))
     assert book.broken == ["slot 3: agent 1 claims others dead in probation, or as it leaves"]
-    book = Ledger(3, 3)
-    book.read(0, 1, encode_extended(ExtendedFrame(dataclasses.replace(own, slot=0), leases=bytes([0, 2]))))
+    book = GrantLedger(3, 3)
+    book.note_frame(0, 1, encode_extended(ExtendedFrame(dataclasses.replace(own, slot=0), leases=bytes([0, 2]))))
     [(turn, [(_, lessee)])] = book.issued.items()
     own = dataclasses.replace(own, sender=lessee, slot=turn - 2)
-    book.read(turn - 2, lessee, encode_extended(ExtendedFrame(own, relay=((2, 1),))))
+    book.note_frame(turn - 2, lessee, encode_extended(ExtendedFrame(own, relay=((2, 1),))))
     assert book.broken == [f"slot {turn - 2}: agent 2 hands turn {turn} on to 1"]
 
 
@@ -162,20 +162,20 @@ def test_frames_against_the_rules_are_found_and_turns_of_unrecorded_frames_not_j
     config = SwarmConfig(agents=3, policy="tdma")
     state = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     for policy, raises in (("tdma", True), ("aloha", False)):
-        judge = Judge(dataclasses.replace(config, policy=policy))
+        judge = RuleChecker(dataclasses.replace(config, policy=policy))
         for slot, sender in enumerate((1, 2, 1)):
-            judge.slot(slot, {sender: encode_frame(Frame(sender, slot, 1, *state))})
+            judge.check_slot(slot, {sender: encode_frame(Frame(sender, slot, 1, *state))})
         result = Result("bag", "lockstep")
         with pytest.raises(Mismatch, match="slot 2: agent 1 sends in a turn of 3") if raises else nullcontext():
-            result.take_judgement(judge)
+            result.note_rules(judge)
     # A frame that is made too late is not sent; its agent keeps to what it gave away in it all the same.
     config = SwarmConfig(agents=3, policy="lease", anchor_every=3, open_every=0, adoption=False)
     state = ((0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
     reach = (config.main_every + 2) * config.agents
-    for late, later, broken, unjudged in (((), 0, 1, 0), ((2,), 0, 0, 1), ((2,), reach, 1, 0)):
-        judge = Judge(config)
-        judge.slot(0, {1: encode_extended(ExtendedFrame(Frame(1, 0, 1, *state)))})
-        judge.slot(1, {}, unrecorded=late)
+    for late, later, broken, unchecked in (((), 0, 1, 0), ((2,), 0, 0, 1), ((2,), reach, 1, 0)):
+        judge = RuleChecker(config)
+        judge.check_slot(0, {1: encode_extended(ExtendedFrame(Frame(1, 0, 1, *state)))})
+        judge.check_slot(1, {}, unrecorded=late)
         wrong = 3 + later  # a turn of agent 1
-        judge.slot(wrong, {2: encode_extended(ExtendedFrame(Frame(2, wrong, 1, *state)))})
-        assert (len(judge.broken), judge.unjudged) == (broken, unjudged)
+        judge.check_slot(wrong, {2: encode_extended(ExtendedFrame(Frame(2, wrong, 1, *state)))})
+        assert (len(judge.broken), judge.unchecked) == (broken, unchecked)

@@ -28,8 +28,8 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import VARIABLE
 from dtsa_bench.log.agent_bag import AgentBag, read
-from dtsa_bench.log.merge.merge import Merge, verified
-from dtsa_bench.log.merged_bag import align, write_merged
+from dtsa_bench.log.merge.merge import Merge, is_verified
+from dtsa_bench.log.merged_bag import write_merged
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
 from dtsa_bench.simulation.simulate import simulate
@@ -283,10 +283,10 @@ def fly(trial: Trial, directory: Path, disturb: Callable[[Any], None], **simulat
         medium = flight.findings(begun, flown)
         airtime = flight.config.airtime if trial.modems is None else None
     merged = Merge(flight.bags())
-    found = merged.judge(*([] if airtime is None else [airtime.on_air_ns(HEADER + trial.swarm.frame_length)]))
-    assert verified(found), (found["decisions_again"], found["turns"]["which"], found["frames_heard_not_as_sent"])
+    found = merged.summary(*([] if airtime is None else [airtime.on_air_ns(HEADER + trial.swarm.frame_length)]))
+    assert is_verified(found), (found["decisions_again"], found["turns"]["which"], found["frames_heard_not_as_sent"])
     assert found["flight"] is not None, "they never counted alike"
-    write_merged(directory / WHOLE, align(merged, found), found)
+    write_merged(directory / WHOLE, merged.log, found)
     checked = verify_bag(directory / WHOLE)
     assert checked.ok, checked.difference
     channel = {"loss": trial.channel["loss"], **simulators}

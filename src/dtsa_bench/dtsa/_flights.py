@@ -10,8 +10,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, Registry
 from dtsa_agent.core.settings.flight_models import AVOIDERS
 from dtsa_bench.experiments.sweep import run_config as _run_config
-from dtsa_bench.log.arrays import LogBuilder
-from dtsa_bench.log.flight_log import FlightLog
+from dtsa_bench.log.flight_log import FlightLog, log_of_flight
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import simulate as _simulate
 
@@ -66,10 +65,7 @@ def simulate(config: RunConfig | None = None, *, trace: bool = True, **settings:
     :raises ConfigError: for a setting that is not usable, or both a config and settings.
     """
     run = config_of(config, settings)
-    flight = _simulate(run, log=trace, frames=trace)
-    if flight.log is not None:
-        return flight.to_log()
-    return FlightLog(**LogBuilder(run).fields(flight.swarm.track), results=flight.summary(), is_kept=False)
+    return log_of_flight(_simulate(run, log=trace, frames=trace))
 
 
 def open(path: str | Path) -> FlightLog:

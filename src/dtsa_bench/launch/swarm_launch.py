@@ -36,7 +36,7 @@ def _settings(cls: type) -> list:
     ]
 
 
-def _given(context: LaunchContext, cls: type, prefix: str = "") -> dict:
+def _given_arguments(context: LaunchContext, cls: type, prefix: str = "") -> dict:
     """Settings from the launch arguments that were given."""
     values = {}
     for setting in _settings(cls):
@@ -56,11 +56,13 @@ def _run_config(context: LaunchContext, swarm: SwarmConfig, channel: dict) -> Ru
     air = ChannelConfig.from_yaml(file, **values) if file else ChannelConfig.from_dict(values)
     mode = LaunchConfiguration("mode").perform(context)
     align = LaunchConfiguration("align").perform(context) == "true"
-    return RunConfig(swarm, air, mode=mode, clocks=ClockConfig(**_given(context, ClockConfig, CLOCKS)), align=align)
+    return RunConfig(
+        swarm, air, mode=mode, clocks=ClockConfig(**_given_arguments(context, ClockConfig, CLOCKS)), align=align
+    )
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
-    swarm, channel = _given(context, SwarmConfig), _given(context, ChannelConfig)
+    swarm, channel = _given_arguments(context, SwarmConfig), _given_arguments(context, ChannelConfig)
     config = SwarmConfig.from_dict({key: value for key, value in swarm.items() if key != "options"})
     run = _run_config(context, config, channel)
     space = "/" + LaunchConfiguration("swarm_namespace").perform(context).strip("/")
@@ -69,8 +71,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
     recorded = {
         **swarm,
         **channel,
-        **_given(context, RunLimits),
-        **{CLOCKS + name: value for name, value in _given(context, ClockConfig, CLOCKS).items()},
+        **_given_arguments(context, RunLimits),
+        **{CLOCKS + name: value for name, value in _given_arguments(context, ClockConfig, CLOCKS).items()},
         "mode": run.mode,
         "align": run.align,
         "priority": priority and priority + 1,

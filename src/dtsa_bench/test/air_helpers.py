@@ -25,8 +25,9 @@ from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
 from dtsa_bench.log.agent_bag import AgentRecorder, read
-from dtsa_bench.log.merge.merge import Merge, verified
-from dtsa_bench.log.merged_bag import MergedFlight, align, write_merged
+from dtsa_bench.log.arrays import FlightArrays
+from dtsa_bench.log.merge.merge import Merge, is_verified
+from dtsa_bench.log.merged_bag import write_merged
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.network.sniffer import Sniffer
 from dtsa_bench.pages.view.history import MAX_MOMENTS, RunHistory
@@ -189,11 +190,11 @@ def listening(config: SwarmConfig, settings: PortSettings) -> Iterator[Callable[
         thread.join()
 
 
-def merge_bags(paths: Iterable[Path], whole: Path) -> tuple[MergedFlight, dict[str, Any]]:
+def merge_bags(paths: Iterable[Path], whole: Path) -> tuple[FlightArrays, dict[str, Any]]:
     """The merged run, and what was found of it; its bag is written to `whole`."""
     together = Merge([read(path) for path in paths])
-    merged = together.judge()
-    run = align(together, merged)
+    merged = together.summary()
+    run = together.log
     write_merged(whole, run, merged)
     return run, merged
 
@@ -206,5 +207,5 @@ def check_merged(merged: dict[str, Any], whole: Path, decisions: int) -> None:
     again = merged["decisions_again"]
     assert again["differences"] == []
     assert again["equal"] == again["of"] > decisions
-    assert verified(merged)
+    assert is_verified(merged)
     assert verify_bag(whole).to_dict()["difference"] is None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_bench.log.rules import Ledger
+from dtsa_bench.log.rules import GrantLedger
 from dtsa_channel_sim import Channel, ChannelConfig
 
 RADIUS, TURN = 2.0, 0.5  # m, rad/s: those that move fly circles, at 1 m/s
@@ -63,7 +63,7 @@ class Outcome:
     age_sum: int = 0  # over pairs (observer, agent that it takes for a mover), every slot after the warm-up
     age_count: int = 0
     waits: list[Wait] = field(default_factory=list)
-    ledger: Ledger | None = None
+    ledger: GrantLedger | None = None
 
     @property
     def age(self) -> float:
@@ -116,7 +116,7 @@ class Experiment:
         for event in events:
             self._events.setdefault(event.slot, []).append(event)
         if config.policy_row.agent_state:
-            self.outcome.ledger = Ledger(config.agents, config.anchor_every, config.main_every)
+            self.outcome.ledger = GrantLedger(config.agents, config.anchor_every, config.main_every)
         self.swarm.active[:] = 0
         self.swarm.final[:] = final
         for agent in movers:
@@ -175,7 +175,7 @@ class Experiment:
         senders = swarm.begin(slot)
         ids = tuple(k + 1 for k in senders)
         if out.ledger is not None:
-            out.ledger.slot(slot, {k + 1: swarm.frame(k) for k in senders})
+            out.ledger.check_slot(slot, {k + 1: swarm.frame(k) for k in senders})
         if senders:
             verdict = self.channel.arbitrate(slot, ids, positions=swarm.position)
             for row, k in enumerate(senders):

@@ -204,11 +204,11 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
         from dtsa_agent.core.errors import ConfigError
         from dtsa_bench.crazyflies.peer_lab.app import LabSettings
         from dtsa_bench.crazyflies.peer_lab.process import fly
-        from dtsa_bench.runs.options import given, new_directory
+        from dtsa_bench.runs.options import given_options, new_directory
 
         if not 0.0 < args.seconds <= 1e6:
             raise ConfigError("seconds", args.seconds, "more than 0, up to 1000000")
-        settings = LabSettings(**given(args, LabSettings, "lab"))
+        settings = LabSettings(**given_options(args, LabSettings, "lab"))
         parameters = dict(map(_parameter, args.set))
         out = None if args.out is None else new_directory(args.out)
         swarm, place = None, args.app

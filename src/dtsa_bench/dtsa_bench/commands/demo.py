@@ -85,7 +85,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
     clear_hindrances(os.environ)
     from dtsa_agent.stop import Stop
     from dtsa_bench.pages.demo.flights import HEAD, demo_steps, fly_all, table_rows
-    from dtsa_bench.pages.report.page import write_report
+    from dtsa_bench.pages.report.data import write_report
 
     begin = time.monotonic()
     steps = demo_steps(seed)

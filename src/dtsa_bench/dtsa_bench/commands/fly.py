@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_bench.flights.options import FlightOptions
-from dtsa_bench.runs.options import add_mode_options, add_options, add_run_options, given, run_config, whole_number
+from dtsa_bench.runs.options import (
+    add_mode_options,
+    add_options,
+    add_run_options,
+    given_options,
+    run_config,
+    whole_number,
+)
 
 from .crazyflies import add_simulated_radio, use_simulated_radio
 from .registry import Command
@@ -98,7 +105,7 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
             domain=domain,
             pictures=args.picture,
             late=late_agents(args.late),
-            **given(args, FlightOptions, "flight"),
+            **given_options(args, FlightOptions, "flight"),
         )
         page = page_options(args)
         with Stop(LONGEST_END_S) as stop, ExitStack() as pages:

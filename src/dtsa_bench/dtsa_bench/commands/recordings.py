@@ -136,7 +136,7 @@ prints."""
     def run(self, args: argparse.Namespace) -> int:
         """Write the report."""
         from dtsa_bench.log.bag.metadata import bag_of
-        from dtsa_bench.pages.report.page import write_report
+        from dtsa_bench.pages.report.data import write_report
 
         first = bag_of(args.bags[0]).resolve()
         out = Path(args.out) if args.out else first.parent / "report.html"
@@ -175,19 +175,19 @@ bag take like any other."""
     def run(self, args: argparse.Namespace) -> int:
         """Merge, and print what came of it."""
         from dtsa_bench.log.agent_bag import read_all
-        from dtsa_bench.log.merge.merge import Merge, clocks_apart, verified
+        from dtsa_bench.log.merge.merge import Merge, clocks_apart, is_verified
         from dtsa_bench.runs.options import check_free, number
 
         out = Path(args.out) if args.out else None
         if out is not None:
-            from dtsa_bench.log.merged_bag import align, write_merged
+            from dtsa_bench.log.merged_bag import write_merged
 
             check_free(out)
         air_ns = round(number(args.air_us, "air_us", 0, 1e6, "us") * 1e3)
         merged = Merge(*read_all(args.bags))
-        summary = merged.judge(air_ns)
+        summary = merged.summary(air_ns)
         if out is not None:
-            write_merged(out, align(merged, summary), summary)
+            write_merged(out, merged.log, summary)
         text = json.dumps(summary, indent=2) + "\n"
         print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
         if summary["unheard"]:
@@ -196,7 +196,7 @@ bag take like any other."""
             print(f"dtsa: {clocks_apart(merged.apart)}", file=sys.stderr)
         for path in merged.nothing_written:
             print(f"dtsa: {path}: nothing was written there; left out", file=sys.stderr)
-        return 0 if verified(summary) and not summary["unheard"] else 1
+        return 0 if is_verified(summary) and not summary["unheard"] else 1
 
 
 def summary_lines(summary: dict[str, object]) -> list[str]:

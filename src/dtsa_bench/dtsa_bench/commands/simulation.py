@@ -17,7 +17,7 @@ from .registry import Command
 
 if TYPE_CHECKING:
     from dtsa_bench.experiments.sweep import Sweep
-    from dtsa_bench.simulation.simulate import Flight
+    from dtsa_bench.simulation.simulate import SimulatedFlight
 
 
 class SimulateCommand(Command):
@@ -78,7 +78,7 @@ def _checked(picture: Path) -> Path:
     return picture
 
 
-def _draw(picture: Path, flight: Flight, summary: dict[str, Any]) -> None:
+def _draw(picture: Path, flight: SimulatedFlight, summary: dict[str, Any]) -> None:
     from dtsa_bench.drawing import optional_picture
 
     assert flight.log is not None

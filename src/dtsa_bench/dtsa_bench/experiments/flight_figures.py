@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dtsa_bench.drawing import palette
 from dtsa_bench.drawing.flight_paths import paint
 from dtsa_bench.drawing.style import CYCLE, INK, add_legend, panels
-from dtsa_bench.simulation.simulate import Flight, simulate
+from dtsa_bench.simulation.simulate import SimulatedFlight, simulate
 
 from .tables import SweepTable
 
@@ -20,7 +20,7 @@ Spec = Mapping[str, Any]
 TRUE, ESTIMATED, RECEIVED = palette.SERIES[2], INK, palette.SERIES[4]
 
 
-def _flights(table: SweepTable, spec: Spec) -> list[tuple[str, Flight]]:
+def _flights(table: SweepTable, spec: Spec) -> list[tuple[str, SimulatedFlight]]:
     """One flight of the first seed for each level of ``facets``, flown again with a log."""
     facets = table.levels(spec["facets"])
     groups = [table.where(**{spec["facets"]: facet})[0] for facet in facets]
@@ -31,7 +31,7 @@ def _flights(table: SweepTable, spec: Spec) -> list[tuple[str, Flight]]:
     ]
 
 
-def _movers(flight: Flight) -> NDArray[np.int64]:
+def _movers(flight: SimulatedFlight) -> NDArray[np.int64]:
     return np.flatnonzero(flight.scenario.moving)
 
 
@@ -99,7 +99,7 @@ def estimate(table: SweepTable, spec: Spec) -> Figure:
     return figure
 
 
-def _busiest(flight: Flight, length: int = 160) -> tuple[int, int]:
+def _busiest(flight: SimulatedFlight, length: int = 160) -> tuple[int, int]:
     """The slots in which the shown mover turns most."""
     assert flight.log is not None
     seen = int(_movers(flight)[-1])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm
 from dtsa_bench.runs.config import RunConfig
-from dtsa_bench.runs.hearing import Hearing
+from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import FlightMetrics, metrics_tables
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
@@ -25,7 +25,7 @@ class FlightMeasurement(ChannelObserver, Referee):
     def __init__(self, run: RunConfig, scenario: Scenario) -> None:
         self.scenario = scenario
         self.metrics = FlightMetrics(run, scenario)
-        self.hearing = Hearing(run.swarm.agents)
+        self.hearing = DeliveryCounts(run.swarm.agents)
         self.positions = PositionLog(run.swarm.agents)
         self.begin_s = self.end_s = 0.0  # wall clock: slot 0 answered by all, flight over; 0: not yet
         self._tables = metrics_tables(run, scenario, everyone=True)
@@ -72,7 +72,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         self._lengths = [len(frames[sender]) for sender in verdict.senders]
         self.scenario.advance(slot, self._tables)  # what all know about each other's goals
         mask = verdict.mask(self._agents)
-        self.hearing.slot(len(verdict.senders), mask)
+        self.hearing.add_slot(len(verdict.senders), mask)
         if answers.receipts is not None:  # in real time the receivers themselves know best
             for taken in answers.receipts:
                 self._hear(taken.slot, taken.data, taken.mask)
@@ -84,7 +84,7 @@ class FlightMeasurement(ChannelObserver, Referee):
 
     def _hear(self, slot: int, data: bytes, mask: NDArray[np.bool_]) -> None:
         if self._tables.hear(slot, data, mask):
-            self.hearing.take_in(mask)
+            self.hearing.add_accepted(mask)
 
     def agent_silent(self, agent: int) -> None:
         self.metrics.lose(agent)

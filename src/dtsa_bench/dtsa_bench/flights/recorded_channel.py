@@ -85,8 +85,8 @@ class RecordedFlight:
         result = {**self.measurement.summary(), "unusable_messages": channel.intake.total}
         result["not_taken_in"] = kept_out = dict(sorted(channel.dropped().items()))
         hearing = self.measurement.hearing
-        hearing.settle(kept_out)
-        result["receptions"] = {"delivered": hearing.delivered, "taken_in": hearing.taken_in}
+        hearing.subtract_refused(kept_out)
+        result["receptions"] = {"delivered": hearing.delivered, "taken_in": hearing.accepted}
         result["unheard"] = hearing.problem(kept_out) or None
         if isinstance(channel, RealtimeChannel):
             result |= {

@@ -1,4 +1,4 @@
 """What happened in a flight: the log, how it is recorded, read, replayed, verified, joined and exported.
 
-It imports `drawing` and `runs`.
+It imports `simulation`, `drawing` and `runs`.
 """

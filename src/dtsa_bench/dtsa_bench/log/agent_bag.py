@@ -9,22 +9,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import monotonic, monotonic_ns
+from time import monotonic_ns
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.records import Channel, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
-from rosbags.serde import SerdeError
-from zstandard import ZstdError
+from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.air.port import flight_ns, frame_in
 from dtsa_agent.air.port import PortProperties, PortSettings
@@ -35,8 +30,12 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import pack_received
-from dtsa_bench import __version__
 from dtsa_bench.log.arrays import NEW
+from dtsa_bench.log.bag import metadata
+from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, checksum_fault, register_type
+from dtsa_bench.log.bag.recover import RecordScan
+from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
 from dtsa_bench.log.record import (
     AGENT,
     FORMAT,
@@ -46,28 +45,41 @@ from dtsa_bench.log.record import (
     cut_frames,
     frame_fields,
     pack_record,
-    record_codec,
 )
-from dtsa_bench.log.bag import metadata, schema
-from dtsa_bench.log.bag.errors import BagError, UnusableBag
-from dtsa_bench.log.bag.writer import BROKEN_OFF
 from dtsa_bench.runs.config import REALTIME
 from dtsa_bench.runs.options import new_directory
 from dtsa_bench.runs.program import program
-
-from .merge.joined import AgentBag
 
 if TYPE_CHECKING:
     from dtsa_agent.air.driver import LiveAgent
 
 SUMMARY = "summary"  # name in custom data
-_FLUSH_S = 0.5
 _CHUNK = 1 << 18  # bytes
 _AT_A_TIME = 8  # slots: several at a time take half as long
-_LONGEST_RECORD = 1 << 24  # bytes
 _NAME = re.compile(r"cf\d+\.mcap")
-_DAMAGE = (McapError, ZstdError, SerdeError, struct.error, EOFError, ValueError, KeyError, TypeError, AttributeError)
-_DAMAGE += (AssertionError, IndexError)  # of rosbags, in a message that is none
+
+
+@dataclass(slots=True)
+class AgentBag:
+    """What one agent recorded of itself."""
+
+    path: Path
+    agent: int  # id
+    swarm: SwarmConfig
+    port: PortProperties
+    started_ns: int  # own clock, when its process began
+    slots: list[SlotRecord] = field(default_factory=list)  # ascending, but where it took over another time
+    refused: Counter[str] = field(default_factory=Counter)  # datagrams not accepted, by reason
+    summary: dict[str, Any] = field(default_factory=dict)  # its own; empty: it was killed
+    broken_off: bool = False  # the file was not finished, or is damaged
+    damage: str = ""  # why a finished file is not as it was finished; empty: it is
+    goals_told: bool = False  # it was told goals in flight: none was known to be its last
+    zero_ns: int = 0  # what its clock showed at time 0 of the bag
+
+    @property
+    def flight_ns(self) -> int:
+        """From the order to send a frame to its arrival as the agents take it to be, ns."""
+        return flight_ns(self.swarm, self.port)
 
 
 # -- writing ---------------------------------------------------------------------------------------------------------
@@ -81,47 +93,16 @@ class RecordFile:
     """
 
     def __init__(self, path: Path, swarm: SwarmConfig, custom: dict[str, str]) -> None:
-        self.path, self.failure, self._count, self._times = path, "", 0, (0, 0)
         settings = {"swarm": swarm.to_dict(), "mode": REALTIME}
-        self.custom = {
-            "project": "dtsa", "version": __version__, FORMAT_KEY: FORMAT, "seed": str(swarm.seed),
-            "configuration": json.dumps(settings, sort_keys=True), **custom,
-        }  # fmt: skip
-        self._definition = schema.installed(TYPE)
-        try:
-            self._stream = path.open("xb")
-            self._mcap = Writer(self._stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
-            self._mcap.start(profile="ros2", library=f"dtsa {__version__}")
-            self._add_metadata()
-        except OSError as error:
-            raise BagError(f"cannot record to {path}: {error.strerror or error}") from error
-        channel = {
-            "offered_qos_profiles": metadata.dump_profiles([metadata.PROFILES["reliable"]]),
-            "topic_type_hash": self._definition.type_hash,
-        }
-        number = self._mcap.register_schema(TYPE, "ros2msg", self._definition.text.encode())
-        self._channel = self._mcap.register_channel(SLOT_RECORD, "cdr", number, channel)
-        self._next_flush = monotonic() + _FLUSH_S
-
-    def _add_metadata(self) -> None:
-        start_ns, end_ns = self._times
-        content = {
-            "version": metadata.VERSION, "storage_identifier": "mcap", "message_count": self._count,
-            "starting_time": {"nanoseconds_since_epoch": start_ns}, "duration": {"nanoseconds": end_ns - start_ns},
-            "compression_format": "", "compression_mode": "", "relative_file_paths": [self.path.name],
-            "custom_data": self.custom, "ros_distro": "jazzy",
-        }  # fmt: skip
-        self._mcap.add_metadata(metadata.RECORD_NAME, {metadata.RECORD_KEY: metadata.dump(content)})
+        self.path, self.failure = path, ""
+        self._bag = BagWriter(path, settings, chunk_size=_CHUNK, custom_data={FORMAT_KEY: FORMAT, **custom})
+        self._channel = self._bag.add_topic(SLOT_RECORD, TYPE)
+        self.custom = self._bag.custom_data
 
     def write(self, time_ns: int, data: bytes) -> None:
         """Record a message."""
-        at = max(names.TIME_ZERO_NS, time_ns)
-        self._times = (self._times[0] or at, at)
-        self._try(lambda: self._mcap.add_message(self._channel, at, data, at, self._count))
-        self._count += 1
-        if monotonic() >= self._next_flush:
-            self._next_flush = monotonic() + _FLUSH_S
-            self._try(self._mcap.flush)
+        at_ns = max(names.TIME_ZERO_NS, time_ns)
+        self._try(lambda: self._bag.write(self._channel, data, at_ns, at_ns))
 
     def _try(self, act: Callable[[], object]) -> None:
         """Write, unless writing has failed before."""
@@ -129,14 +110,12 @@ class RecordFile:
             return
         try:
             act()
-        except OSError as error:
-            self.failure = f"recording to {self.path} stopped: {error.strerror or error}"
+        except BagError as error:
+            self.failure = str(error)
 
     def close(self) -> None:
         """Finish the file."""
-        self._try(self._add_metadata)
-        self._try(self._mcap.finish)
-        self._try(self._stream.close)
+        self._try(self._bag.close)
 
 
 class AgentRecorder:
@@ -259,43 +238,85 @@ def find_bag(path: str | Path) -> Path:
 
 
 def read(path: str | Path) -> AgentBag:
-    """The bag of an agent; of a file that was not finished, what is whole.
+    """The bag of an agent; of a file that was not finished, or is damaged, what is whole.
 
-    :raises UnusableBag: if it is no bag of an agent on a network.
+    :raises UnusableBag: if it is no bag of an agent on a network, or its messages are not those that were recorded.
     :raises NothingWritten: if its process ended before it wrote anything.
     """
     file = find_bag(path)
-    bag: AgentBag | None = None
-    topics: dict[int, str] = {}
-    unpack: Callable[[bytes], Any] | None = None
-    is_finished = False
     try:
         if not file.stat().st_size:
             raise NothingWritten(file, "is empty")
-        with file.open("rb") as stream:
-            try:
-                for record in StreamReader(stream, validate_crcs=True, record_size_limit=_LONGEST_RECORD).records:
-                    if isinstance(record, Channel):
-                        topics[record.id] = record.topic
-                    elif isinstance(record, Schema) and record.name == TYPE:
-                        unpack = record_codec(record.data.decode())
-                    elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
-                        bag = _read_about(file, record, bag)
-                    elif isinstance(record, Message) and bag is not None and unpack is not None:
-                        if topics.get(record.channel_id) == SLOT_RECORD:
-                            _add_slot(bag, unpack(record.data))
-                is_finished = True
-            except UnusableBag:
-                raise
-            except _DAMAGE as error:
-                if bag is None:
-                    raise UnusableBag(file, f"not readable ({error})") from None
     except OSError as error:
         raise UnusableBag(file, error.strerror or str(error)) from None
-    if bag is None:
-        raise UnusableBag(file, f"no bag of an agent on a network, as `{program()} agent --out` makes them")
-    bag.broken_off = bag.broken_off or not is_finished
+    reader = _Reader(file)
+    with ExitStack() as stack:
+        scan = RecordScan(file, path, stack)
+        for record in scan.records():
+            if scan.faults or not reader.add(record):
+                break
+    if reader.bag is None:
+        why = f"not readable ({scan.faults[0]})" if scan.faults else (
+            f"no bag of an agent on a network, as `{program()} agent --out` makes them")  # fmt: skip
+        raise UnusableBag(file, why)
+    bag = reader.finish(scan.is_finished and not scan.faults)
+    if scan.is_finished or scan.is_closed:
+        bag.damage = scan.faults[0] if scan.faults else checksum_fault(file)
     return bag
+
+
+class _Reader:
+    """Makes the bag of an agent of the records of its file."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self.bag: AgentBag | None = None
+        self._channel = 0  # of the slot records
+        self._store = get_typestore(Stores.EMPTY)
+        self._custom: dict[str, str] = {}
+        self._digest = BagDigest()
+
+    def add(self, record: Any) -> bool:
+        """Add a record of the file; return whether it can be used: what follows one that cannot is left out."""
+        try:
+            self._add(record)
+        except UnusableBag:
+            raise
+        except NOT_OF_ITS_TYPE:
+            return False
+        return True
+
+    def _add(self, record: Any) -> None:
+        if isinstance(record, Channel) and record.topic == SLOT_RECORD:
+            self._channel = record.id
+        elif isinstance(record, Schema) and record.name == TYPE:
+            register_type(self._store, TYPE, record.data.decode())
+        elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
+            custom = metadata.custom_data(metadata.load_record(record))
+            self._custom |= custom if AGENT in custom else {}
+            self.bag = self.bag or (_make_bag(self._file, custom) if AGENT in custom else None)
+        elif isinstance(record, Message) and record.channel_id == self._channel and self.bag:
+            times = record.log_time, record.publish_time, record.sequence
+            self._digest.add(SLOT_RECORD.encode(), *times, record.data, True)
+            _add_slot(self.bag, self._store.deserialize_cdr(record.data, TYPE))
+
+    def finish(self, is_finished: bool) -> AgentBag:
+        """The bag, when all that is whole has been added."""
+        bag, custom = self.bag, self._custom
+        assert bag is not None
+        if is_finished and KEY in custom and custom[KEY] != self._digest.hexdigest():
+            raise UnusableBag(self._file, "a message was changed, left out, added or moved after the recording")
+        bag.broken_off = not is_finished
+        try:
+            if BROKEN_OFF in custom:  # `recover` has made this file of one that was not finished, or is damaged
+                bag.broken_off, whole_ns = True, int(custom[BROKEN_OFF])
+                bag.slots = [one for one in bag.slots if one.start_ns - bag.zero_ns + names.TIME_ZERO_NS <= whole_ns]
+            bag.summary = json.loads(custom.get(SUMMARY, "{}"))
+            refused = bag.summary.get("not_taken_in", {}).items()
+            bag.refused = Counter({str(why): int(count) for why, count in refused})
+        except (ValueError, TypeError, AttributeError) as error:
+            raise UnusableBag(self._file, f"what it says of its agent cannot be read ({error})") from None
+        return bag
 
 
 def find_bags(path: str | Path) -> list[Path]:
@@ -327,45 +348,37 @@ def read_all(paths: Sequence[str | Path]) -> tuple[list[AgentBag], list[str]]:
     return bags, nothing
 
 
-def _read_about(file: Path, record: Metadata, bag: AgentBag | None) -> AgentBag | None:
-    custom = metadata.custom_data(metadata.load(record.metadata.get(metadata.RECORD_KEY, "")))
-    if AGENT not in custom:
-        return bag
+def _make_bag(file: Path, custom: dict[str, str]) -> AgentBag:
+    """The bag of the agent that a file's metadata describes."""
     try:
         about = json.loads(custom[AGENT])
-        if bag is None:
-            swarm = SwarmConfig.from_dict(json.loads(custom["configuration"])["swarm"])
-            port = PortProperties(**about["port"])
-            bag = AgentBag(
-                file, int(about["id"]), swarm, port, int(about["started_ns"]),
-                goals_told=bool(about["goals_told"]), zero_ns=int(about["zero_ns"]),
-            )  # fmt: skip
-        bag.broken_off = BROKEN_OFF in custom  # `recover` has made this file of one that was not finished
-        bag.summary = json.loads(custom.get(SUMMARY, "{}"))
-        bag.refused = Counter({str(why): int(count) for why, count in bag.summary.get("not_taken_in", {}).items()})
+        return AgentBag(
+            file, int(about["id"]), SwarmConfig.from_dict(json.loads(custom["configuration"])["swarm"]),
+            PortProperties(**about["port"]), int(about["started_ns"]), goals_told=bool(about["goals_told"]),
+            zero_ns=int(about["zero_ns"]),
+        )  # fmt: skip
+    except ConfigError as error:
+        raise UnusableBag(file, f"its settings cannot be read ({error})") from None
     except (KeyError, ValueError, TypeError, AttributeError) as error:
-        if isinstance(error, ConfigError):
-            raise UnusableBag(file, f"its settings cannot be read ({error})") from None
         raise UnusableBag(file, f"what it says of its agent cannot be read ({error})") from None
-    return bag
 
 
-def _add_slot(bag: AgentBag, said: Any) -> None:
+def _add_slot(bag: AgentBag, message: Any) -> None:
     """A record of the agent's own clock."""
-    stamp = said.header.stamp
+    stamp = message.header.stamp
     start_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) - names.TIME_ZERO_NS + bag.zero_ns
-    (presence,), is_sent = said.presence.tolist(), len(said.sender) > 0
-    frames = cut_frames(said.heard_data, said.heard_length, len(said.heard_sender))
-    is_before = said.heard_before.tolist() or [0] * len(frames)
-    columns = zip(said.heard_sender.tolist(), said.heard_slot.tolist(), said.heard_ns.tolist(), frames, strict=True)
+    (presence,), is_sent = message.presence.tolist(), len(message.sender) > 0
+    frames = cut_frames(message.heard_data, message.heard_length, len(message.heard_sender))
+    is_before = message.heard_before.tolist() or [0] * len(frames)
+    columns = zip(message.heard_sender.tolist(), message.heard_slot.tolist(), message.heard_ns.tolist(), frames, strict=True)
     heard = [ReceivedFrame(sender, slot, start_ns + at_ns, data, True) for sender, slot, at_ns, data in columns]
-    datagram = said.data.tobytes() if is_sent else b""
+    datagram = message.data.tobytes() if is_sent else b""
     frame = frame_in(datagram, bag.swarm)
     record = SlotRecord(
-        int(said.slot), start_ns, start_ns, bool(presence & NEW), presence & ~NEW, int(said.chosen[0]),
-        int(said.reason[0]), int(said.digest[0]), float(said.score[0]), said.track.reshape(-1, 3), said.velocity,
-        said.command, said.goal, frame=frame[: len(frame) - (TAG_LENGTH if bag.swarm.auth else 0)],
-        sent_ns=start_ns + int(said.sent_ns[0]) if is_sent else -1, datagram=datagram,
+        int(message.slot), start_ns, start_ns, bool(presence & NEW), presence & ~NEW, int(message.chosen[0]),
+        int(message.reason[0]), int(message.digest[0]), float(message.score[0]), message.track.reshape(-1, 3), message.velocity,
+        message.command, message.goal, frame=frame[: len(frame) - (TAG_LENGTH if bag.swarm.auth else 0)],
+        sent_ns=start_ns + int(message.sent_ns[0]) if is_sent else -1, datagram=datagram,
         before=[one for one, early in zip(heard, is_before, strict=True) if early],
         heard=[one for one, early in zip(heard, is_before, strict=True) if not early],
     )  # fmt: skip

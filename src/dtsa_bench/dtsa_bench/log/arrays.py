@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Scenario, Swarm
+from dtsa_agent.core import Scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.frame import EXTENT_M
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_bench.runs.config import RunConfig
-from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
+from dtsa_channel_sim.model.verdict import OUTCOMES
 
 UNKNOWN = len(OUTCOMES)  # outcome of a slot of which not all that could have sent have told
 PRESENT, LEAVING, UNRECORDED, NEW = 1, 2, 64, 128  # presence of an agent; the last two are added
@@ -37,7 +37,7 @@ class SentFrames(NamedTuple):
     collided: NDArray[np.int64]  # receivers at which it collided
 
 
-class HeardFrames(NamedTuple):
+class ReceivedFrames(NamedTuple):
     """Frames that agents with clocks of their own took in, in this order; arrays have one row an entry (H)."""
 
     row: NDArray[np.int64]  # in whose slot they were taken in
@@ -81,7 +81,7 @@ class FlightArrays:
     goal: Floats  # (S, 3, N) m
     sent_ns: NDArray[np.int64] | None = None  # (S, N) ns, with clocks of their own: start of transmissions, likewise
     presence: NDArray[np.uint8] | None = None  # (S, N) PRESENT or LEAVING, UNRECORDED or NEW added; None: all PRESENT
-    heard: HeardFrames | None = None  # in flights of agents with clocks of their own
+    heard: ReceivedFrames | None = None  # in flights of agents with clocks of their own
     first_slot: int = 0  # number that the agents gave slot 0
     merged: dict[str, Any] | None = None  # what the log was merged from; None: it was recorded as one
     earlier: FlightArrays | None = None  # of a merged one: slots before the first that all counted alike
@@ -181,6 +181,17 @@ class FlightArrays:
         return self.data[end - int(self.length[row, sender - 1]) : end]
 
     @cached_property
+    def heard_ends(self) -> list[int]:
+        """(S + 1) where the entries of `heard` of each slot begin, and the last ones end."""
+        rows = np.zeros(0, np.int64) if self.heard is None else self.heard.row
+        return [int(end) for end in np.searchsorted(rows, np.arange(len(self) + 1))]
+
+    @property
+    def parts(self) -> list[FlightArrays]:
+        """The slots before the first that all agents of a merged flight counted alike, if there are some, and the rest."""
+        return [self] if self.earlier is None else [self.earlier, self]
+
+    @cached_property
     def known_receivers(self) -> NDArray[np.int64]:
         """(F,) other agents of which is known whether they received a frame."""
         frames = self.sent_frames
@@ -240,6 +251,9 @@ class FlightArrays:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
+Log = TypeVar("Log", bound=FlightArrays)
+
+
 def missing_slots(recorded: Mask) -> str:
     """The slots without a record, as "slots 158 to 313"; empty: there are none."""
     edges = np.flatnonzero(np.diff(np.concatenate(([True], recorded, [True])).astype(np.int8)))
@@ -269,75 +283,48 @@ def extent_of(settings: Mapping[str, Any]) -> float:
     return float(value) if isinstance(value, (int, float)) and 0 < value < float("inf") else EXTENT_M
 
 
-# -- making one ------------------------------------------------------------------------------------------------------
-_BLOCK = 256  # slots, of the first block of memory
+def empty_arrays(slots: int, agents: int, steps: int, slot_ns: int) -> dict[str, Any]:
+    """The arrays of a log of which nothing is known yet, by their names."""
+    shape, planes = (slots, agents), (slots, 3, agents)
+    kinds = {
+        "length": np.uint8, "lost": np.uint16, "collided": np.uint16, "chosen": np.uint16, "reason": np.uint8,
+        "digest": np.uint32, "score": np.float64, "offset_ns": np.int64, "sent_ns": np.int64, "presence": np.uint8,
+        "known": np.bool_,
+    }  # fmt: skip
+    return {
+        **{name: np.zeros(shape, kind) for name, kind in kinds.items()},
+        **{name: np.full(planes, np.nan) for name in ("velocity", "command", "goal")},
+        "recorded": np.zeros(slots, np.bool_), "outcome": np.full(slots, UNKNOWN, np.uint8),
+        "start_ns": np.arange(slots) * slot_ns, "track": np.full((slots + 1, max(1, steps), 3, agents), np.nan),
+    }  # fmt: skip
 
 
-class LogBuilder:
-    """Fills a log slot by slot from agents of the core.
+def split_log(log: Log, slot: int) -> Log:
+    """A log from a slot on; those before are kept as `earlier`.
 
-    In each slot: :meth:`open` when all have decided and encoded their frames, :meth:`close` with the verdict.
+    :raises ValueError: if the slot is not in it.
     """
+    row = slot - log.first_slot
+    if not 0 <= row <= len(log):
+        raise ValueError(f"slot {slot}, the first common one, is not in it")
+    later = _slice(log, row, len(log))
+    later.earlier = _slice(log, 0, row) if row else None
+    return later
 
-    def __init__(self, config: RunConfig) -> None:
-        self._config, swarm = config, config.swarm
-        n, steps = swarm.agents, swarm.steps
-        self.rows = 0
-        self._shapes: dict[str, tuple[tuple[int, ...], Any]] = {
-            "outcome": ((), np.uint8), "length": ((n,), np.uint8), "lost": ((n,), np.uint16),
-            "collided": ((n,), np.uint16), "chosen": ((n,), np.uint16), "reason": ((n,), np.uint8),
-            "digest": ((n,), np.uint32), "score": ((n,), np.float64), "velocity": ((3, n), np.float64),
-            "command": ((3, n), np.float64), "goal": ((3, n), np.float64), "track": ((steps, 3, n), np.float64),
-        }  # fmt: skip
-        self.arrays = {name: np.zeros((_BLOCK, *shape), kind) for name, (shape, kind) in self._shapes.items()}
-        self.frames: list[dict[int, bytes]] = []  # by sender, a slot
-        self.received: list[Mask] = []  # (F, N), a slot
 
-    def open(self, swarm: Swarm, frames: dict[int, bytes]) -> None:
-        """A slot begins: what the agents decided, and where they are.
-
-        :param frames: by the sender's id.
-        """
-        row, arrays = self.rows, self.arrays
-        if row + 1 >= len(arrays["outcome"]):
-            for name, values in arrays.items():
-                arrays[name] = np.concatenate((values, np.zeros_like(values)))
-        for name in ("chosen", "reason", "digest", "score", "velocity", "command", "goal", "track"):
-            arrays[name][row] = getattr(swarm, name)
-        if row == 0:
-            arrays["track"][0] = swarm.position  # the control instants before slot 0 have not been flown
-        for sender, data in frames.items():
-            arrays["length"][row, sender - 1] = len(data)
-        self.frames.append(frames)
-
-    def close(self, verdict: Verdict) -> None:
-        """The slot is over."""
-        row, arrays = self.rows, self.arrays
-        arrays["outcome"][row] = verdict.outcome
-        if verdict.senders:
-            columns = [sender - 1 for sender in verdict.senders]
-            order = np.argsort(columns)
-            for name, values in (("lost", verdict.lost), ("collided", verdict.collided)):
-                if values is not None:
-                    arrays[name][row, columns] = values
-            mask = verdict.mask(self._config.swarm.agents)
-            self.received.append(mask if len(columns) == 1 else mask[order])
-        else:
-            self.received.append(np.zeros((0, self._config.swarm.agents), np.bool_))
-        self.rows += 1
-
-    def fields(self, track: Floats) -> dict[str, Any]:
-        """The fields of the log, with the positions (K, 3, N) of the last slot, m."""
-        rows, swarm = self.rows, self._config.swarm
-        self.arrays["track"][rows] = track
-        kept = {name: np.ascontiguousarray(values[: rows + (name == "track")]) for name, values in self.arrays.items()}
-        shape = rows, swarm.agents
-        data = b"".join(frames[sender] for frames in self.frames for sender in sorted(frames))
-        received = np.concatenate(self.received) if self.received else np.zeros((0, swarm.agents), np.bool_)
-        fields: dict[str, Any] = {
-            "name": "", "settings": self._config.to_dict(), "agents": swarm.agents, "slot_ns": swarm.slot_ns,
-            "recorded": np.ones(rows, np.bool_), "known": np.ones(shape, np.bool_), "data": data,
-            "received": received, "offset_ns": np.zeros(shape, np.int64),
-            "start_ns": np.arange(rows) * swarm.slot_ns, **kept,
-        }  # fmt: skip
-        return fields
+def _slice(log: Log, first: int, last: int) -> Log:
+    fields: dict[str, Any] = log.__getstate__()
+    for name, values in fields.items():
+        if isinstance(values, np.ndarray) and name not in ("received", "track"):
+            fields[name] = values[first:last]
+    ends = np.concatenate(([0], np.cumsum(log.length.sum(axis=1, dtype=np.int64))))
+    counts = np.concatenate(([0], np.cumsum(log.sent.sum(axis=1))))
+    fields["track"] = log.track[first : last + 1]
+    fields["data"] = log.data[int(ends[first]) : int(ends[last])]
+    fields["received"] = log.received[int(counts[first]) : int(counts[last])]
+    if log.heard is not None:
+        a, b = log.heard_ends[first], log.heard_ends[last]
+        heard = ReceivedFrames(*(values[a:b] for values in log.heard))
+        fields["heard"] = heard._replace(row=heard.row - first)
+    fields["first_slot"] = log.first_slot + first
+    return type(log)(**fields)

@@ -7,11 +7,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from dtsa_agent.core.frame import named_in
 from dtsa_bench.drawing.card import as_html, as_text
 from dtsa_bench.runs.metrics import CRASHED
 from dtsa_bench.runs.summary_text import result_rows, setting_rows, what_came_of_it, what_flew
 
-from .arrays import FlightArrays
+from dtsa_bench.simulation.simulate import SimulatedFlight
+from dtsa_bench.simulation.slot_arrays import SlotWriter
+
+from .arrays import FlightArrays, ReceivedFrames
 
 if TYPE_CHECKING:
     from typing import Any
@@ -144,3 +150,35 @@ class FlightLog(FlightArrays):
         rows.append(("kept", "in memory" if self.file is None else str(self.file)))
         more = "summary, config, slots, frames, decisions, states, ages; dtsa.plot_trajectories(flight)"
         return [*rows, ("more", more)]
+
+
+def log_of_flight(flight: SimulatedFlight) -> FlightLog:
+    """What happened in a simulated flight, and what follows from it; without slots if it kept none."""
+    arrays = flight.log or SlotWriter(flight.swarm, 0, frames=True).finish()
+    config, slots = flight.run.swarm, len(arrays)
+    heard, received = None, arrays.received
+    if flight.accepted is not None:  # who accepted a frame that arrived, received its sender's
+        heard, received = _received_frames(flight, config.agents), received.copy()
+        place = np.cumsum(arrays.sent).reshape(arrays.sent.shape) - 1
+        for frame in flight.accepted:
+            sender, slot = named_in(frame.data) or (0, 0)
+            if 0 < sender <= config.agents and slot <= frame.row and arrays.sent[slot, sender - 1]:
+                received[place[slot, sender - 1]] |= frame.by
+    start = np.broadcast_to(flight.scenario.start, (1, *arrays.position.shape[1:]))
+    return FlightLog(
+        name="", settings=flight.run.to_dict(), agents=config.agents, slot_ns=config.slot_ns,
+        recorded=np.ones(slots, np.bool_), known=np.ones(arrays.sent.shape, np.bool_),
+        start_ns=np.arange(slots) * config.slot_ns, outcome=arrays.outcome, length=arrays.length,
+        data=arrays.data.tobytes(), received=received, lost=arrays.lost, collided=arrays.collided,
+        chosen=arrays.chosen, reason=arrays.reason, digest=arrays.digest, score=arrays.score,
+        offset_ns=np.zeros(arrays.sent.shape, np.int64), track=np.concatenate((start, arrays.position)),
+        velocity=arrays.velocity, command=arrays.command, goal=arrays.goal, heard=heard, results=flight.summary(),
+        is_kept=flight.log is not None,
+    )  # fmt: skip
+
+
+def _received_frames(flight: SimulatedFlight, agents: int) -> ReceivedFrames:
+    frames = flight.accepted or []
+    row, slot = (np.array([getattr(frame, name) for frame in frames], np.int64) for name in ("row", "slot"))
+    by, none = np.array([frame.by for frame in frames], np.bool_).reshape(len(frames), agents), np.zeros_like(row)
+    return ReceivedFrames(row, none, slot, none, by, none.astype(np.bool_), [frame.data for frame in frames])

@@ -12,20 +12,19 @@ from numpy.typing import NDArray
 from dtsa_agent.core import Swarm
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.scenario import make_scenario
-from dtsa_bench.runs.hearing import Hearing, sentence
+from dtsa_bench.runs.delivery import DeliveryCounts, as_sentence
 from dtsa_bench.runs.metrics import FlightMetrics
 
-from .ages import Ages, ObservedPairs
 from .arrays import UNKNOWN, FlightArrays, recorded_config
-from .merge.merged_flight import follow_merged, observed_merged
-from .replay import knowledge_tables, replay_tables
+from .merged_flight import follow_merged, observed_merged
+from .replay import MeanAges, ObservedPairs, knowledge_tables, replay_tables
 
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
     """What a log gives when it is followed slot by slot; nothing where it does not hold enough."""
 
-    ages: Ages | None
+    ages: MeanAges | None
     summary: dict[str, Any]  # as in summary.json
     notes: list[str] = field(default_factory=list)  # what is left out, and why
 
@@ -60,14 +59,14 @@ def follow(log: FlightArrays) -> Knowledge:
         return Knowledge(*follow_merged(log))
     config, scenario = log.config, log.scenario
     assert scenario is not None
-    tables, metrics, hearing = knowledge_tables(log), FlightMetrics(config, scenario), Hearing(log.agents)
-    ages, moving, shared = Ages.empty(len(log), log.agents), scenario.moving, _is_shared(tables)
+    tables, metrics, delivery = knowledge_tables(log), FlightMetrics(config, scenario), DeliveryCounts(log.agents)
+    ages, moving, shared = MeanAges.empty(len(log), log.agents), scenario.moving, _is_shared(tables)
     ages.results[log.agents :] = True
     own = np.zeros((len(tables.observer), log.agents), np.bool_)
     if not shared:
         own[np.arange(len(own)), tables.observer] = True
     track, lengths = _filled(log.track), log.length
-    for row in replay_tables(log, tables, hearing):
+    for row in replay_tables(log, tables, delivery):
         metrics.compare_tables(row, log.digest[row], log.chosen[row])
         outcome = int(log.outcome[row])
         sizes = lengths[row][lengths[row] > 0].tolist()
@@ -75,10 +74,10 @@ def follow(log: FlightArrays) -> Knowledge:
         _estimate(tables, row, track[row + 1, -1])
         counted = (tables.in_ap != 0) & (tables.sent_slot >= 0) & moving & ~own
         gap = tables.estimate_position - track[row + 1, -1]
-        ages.put(row, counted, row - tables.sent_slot, np.sqrt(np.einsum("vik,vik->vk", gap, gap)))
+        ages.set_means(row, counted, row - tables.sent_slot, np.sqrt(np.einsum("vik,vik->vk", gap, gap)))
     if shared:
         ages.observers[:] *= log.agents - 1
-    notes = [sentence(problem)] if (problem := hearing.problem()) else []
+    notes = [as_sentence(problem)] if (problem := delivery.problem()) else []
     return Knowledge(ages, metrics.summary(), notes)
 
 

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import json
 import math
-import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, lru_cache
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.base import TypesysError
+from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import pack_received, unpack_received
 from dtsa_bench.log.bag import schema
-from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
-from dtsa_bench.log.bag.reader import Bag, Message
+from dtsa_bench.log.bag.reader import Bag, register_type
 
-from .arrays import PRESENT, UNKNOWN, HeardFrames, swarm_section
+from .arrays import PRESENT, UNKNOWN, ReceivedFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
 
 SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
@@ -47,8 +43,7 @@ _DECIDED = ("chosen", "reason", "digest", "score")
 def _store() -> Any:
     store = get_typestore(Stores.EMPTY)
     for kind in (TYPE, CONFIGURATION):
-        found = get_types_from_msg(schema.installed(kind).text, kind)
-        store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
+        register_type(store, kind, schema.installed(kind).text)
     return store
 
 
@@ -100,8 +95,7 @@ def load_log(source: Bag | str | Path) -> FlightLog:
         with Bag(source) as bag:
             return load_log(bag)
     check_format(source)
-    decode = record_decoder(source)
-    return build_log(source, (decode(message) for message in source.messages([SLOT_RECORD])))
+    return build_log(source, (record for _, record in source.typed([SLOT_RECORD])))
 
 
 def check_format(bag: Bag) -> None:
@@ -141,25 +135,10 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
     if merged is None:
         return log
     log.merged = merged
-    return split_log(log, int(merged["common_slot"]))
-
-
-def log_of_fields(
-    fields: Iterable[tuple[int, Mapping[str, Any]]],
-    name: str,
-    settings: dict[str, Any],
-    slot_ns: int,
-    merged: dict[str, Any],
-) -> FlightLog:
-    """The log of a merged flight from the fields of its records, by slot, as :func:`pack_record` takes them."""
-    records = []
-    for slot, values in fields:
-        arrays = {key: np.ascontiguousarray(values.get(key, ()), kind).ravel() for key, kind in _KINDS.items()}
-        head = {"header": _header(names.slot_time_ns(slot, slot_ns)), "slot": slot}
-        records.append(SimpleNamespace(**head, outcome=values["outcome"], steps=values["steps"], **arrays))
-    log = _Rows(records, int(settings["swarm"]["agents"]), slot_ns, False).log(name, settings)
-    log.merged = merged
-    return split_log(log, int(merged["common_slot"]))
+    try:
+        return split_log(log, int(merged["common_slot"]))
+    except ValueError as error:
+        raise UnusableBag(bag.given, str(error)) from None
 
 
 def _merged(bag: Bag) -> dict[str, Any] | None:
@@ -209,19 +188,8 @@ class _Rows:
         end = None
         if records and is_whole:  # the last one says where all are at the end, and may say no more
             end = max(records, key=lambda record: int(record.slot))
-        rows = last - self._first + (end is None)
         steps = max((int(record.steps) for record in records), default=1)
-        shape, planes = (rows, agents), (rows, 3, agents)
-        self._arrays: dict[str, Any] = {
-            "recorded": np.zeros(rows, np.bool_), "start_ns": np.arange(rows) * slot_ns, "known": np.zeros(shape, np.bool_),
-            "outcome": np.full(rows, UNKNOWN, np.uint8), "length": np.zeros(shape, np.uint8),
-            "lost": np.zeros(shape, np.uint16), "collided": np.zeros(shape, np.uint16),
-            "chosen": np.zeros(shape, np.uint16), "reason": np.zeros(shape, np.uint8),
-            "digest": np.zeros(shape, np.uint32), "score": np.zeros(shape), "offset_ns": np.zeros(shape, np.int64),
-            "sent_ns": np.zeros(shape, np.int64), "presence": np.zeros(shape, np.uint8),
-            "track": np.full((rows + 1, max(1, steps), 3, agents), np.nan),
-            **{name: np.full(planes, np.nan) for name in ("velocity", "command", "goal")},
-        }  # fmt: skip
+        self._arrays = empty_arrays(last - self._first + (end is None), agents, steps, slot_ns)
         self._frames: dict[tuple[int, int], bytes] = {}  # by row and sender
         self._received: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._heard: list[tuple[int, int, int, int, NDArray[np.bool_], bool, bytes]] = []
@@ -235,7 +203,7 @@ class _Rows:
                 self._add_accounts([record], self._columns(record))
             row = int(record.slot) - self._first
             self._add_frames(record, row)
-            self._add_heard(record, row)
+            self._add_received(record, row)
         if end is not None:
             self._end(end)
         self.has_end = end is not None
@@ -258,7 +226,7 @@ class _Rows:
         arrays, count, steps = self._arrays, len(records[0].agent), self._arrays["track"].shape[1]
         rows = np.array([int(record.slot) - self._first for record in records])
 
-        def put(name: str, shape: tuple[int, ...], index: Any) -> None:
+        def fill(name: str, shape: tuple[int, ...], index: Any) -> None:
             size = math.prod(shape)
             values = [getattr(record, name) for record in records]
             for record, found in zip(records, values, strict=True):
@@ -272,10 +240,10 @@ class _Rows:
         stamps = [(int(record.header.stamp.sec), int(record.header.stamp.nanosec)) for record in records]
         arrays["start_ns"][rows] = [sec * _SECOND + ns - names.TIME_ZERO_NS for sec, ns in stamps]
         for name in _DECIDED:
-            put(name, (count,), own)
+            fill(name, (count,), own)
         planes = (rows, slice(None), at) if isinstance(at, slice) else (rows[:, None, None], np.arange(3)[:, None], at)
         for name in ("velocity", "command", "goal"):
-            put(name, (3, count), planes)
+            fill(name, (3, count), planes)
         for row, record in zip(rows.tolist(), records, strict=True):
             arrays["track"][row][:, :, at] = record.track.reshape(steps, 3, count)
             if len(record.offset_ns):
@@ -303,7 +271,7 @@ class _Rows:
                 raise ValueError(f"slot {record.slot}: an empty frame of cf{sender}")
             self._frames[row, sender], self._received[row, sender] = data, mask
 
-    def _add_heard(self, record: Any, row: int) -> None:
+    def _add_received(self, record: Any, row: int) -> None:
         count = len(record.heard_sender)
         self._own_clocks = self._own_clocks or count > 0 or len(record.offset_ns) > 0
         if not count:
@@ -321,7 +289,7 @@ class _Rows:
         arrays, keys = self._arrays, sorted(self._frames)
         received = np.array([self._received[key] for key in keys], np.bool_).reshape(len(keys), self.agents)
         self._own_clocks = self._own_clocks or settings.get("mode") == names.MODES[1]
-        heard = self._heard_frames() if self._own_clocks else None
+        heard = self._received_frames() if self._own_clocks else None
         presence, sent_ns = arrays.pop("presence"), arrays.pop("sent_ns")
         return FlightLog(
             name=name, settings=settings, agents=self.agents, slot_ns=self.slot_ns,
@@ -330,7 +298,7 @@ class _Rows:
             first_slot=self._first, has_end=self.has_end, **arrays,
         )  # fmt: skip
 
-    def _heard_frames(self) -> HeardFrames:
+    def _received_frames(self) -> ReceivedFrames:
         frames = [
             data or self._frames.get((slot - self._first, sender), b"")
             for _, sender, slot, _, _, _, data in self._heard
@@ -338,7 +306,7 @@ class _Rows:
         columns = list(zip(*self._heard, strict=True)) if self._heard else [()] * 7
         numbers = [np.array(column, np.int64) for column in columns[:4]]
         by = np.array(columns[4], np.bool_).reshape(len(frames), self.agents)
-        return HeardFrames(*numbers, by, np.array(columns[5], np.bool_), frames)
+        return ReceivedFrames(*numbers, by, np.array(columns[5], np.bool_), frames)
 
 
 def cut_frames(data: NDArray[np.uint8], lengths: NDArray[np.uint8], count: int) -> list[bytes]:
@@ -348,61 +316,3 @@ def cut_frames(data: NDArray[np.uint8], lengths: NDArray[np.uint8], count: int) 
     ends = np.cumsum(lengths, dtype=np.int64).tolist()
     whole = data.tobytes()
     return [whole[end - int(length) : end] for end, length in zip(ends, lengths, strict=True)]
-
-
-def split_log(log: FlightLog, slot: int) -> FlightLog:
-    """A log from a slot on; those before are kept as `earlier`."""
-    row = slot - log.first_slot
-    if not 0 <= row <= len(log):
-        raise UnusableBag(log.file or log.name, f"slot {slot}, the first common one, is not in it")
-    earlier, later = _slice(log, 0, row), _slice(log, row, len(log))
-    later.earlier = earlier if row else None
-    return later
-
-
-def _slice(log: FlightLog, first: int, last: int) -> FlightLog:
-    fields: dict[str, Any] = {name: getattr(log, name) for name in log.__dataclass_fields__}
-    for name, values in fields.items():
-        if isinstance(values, np.ndarray) and name not in ("received", "track"):
-            fields[name] = values[first:last]
-    ends = np.concatenate(([0], np.cumsum(log.length.sum(axis=1, dtype=np.int64))))
-    counts = np.concatenate(([0], np.cumsum(log.sent.sum(axis=1))))
-    fields["track"] = log.track[first : last + 1]
-    fields["data"] = log.data[int(ends[first]) : int(ends[last])]
-    fields["received"] = log.received[int(counts[first]) : int(counts[last])]
-    if log.heard is not None:
-        a, b = np.searchsorted(log.heard.row, (first, last)).tolist()
-        heard = HeardFrames(*(values[a:b] for values in log.heard))
-        fields["heard"] = heard._replace(row=heard.row - first, time_ns=heard.time_ns - first * log.slot_ns)
-    fields["first_slot"] = log.first_slot + first
-    return FlightLog(**fields)
-
-
-@lru_cache(maxsize=8)
-def record_codec(definition: str) -> Callable[[bytes], Any]:
-    """What makes a SlotRecord of CDR, by the definition that stands beside it.
-
-    :raises UnusableBag: for a definition that is none.
-    """
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register(get_types_from_msg(definition, TYPE))
-    except (TypesysError, SyntaxError) as error:
-        raise UnusableBag(SLOT_RECORD, f"the definition of {TYPE} cannot be used: {error}") from None
-    return lambda data: store.deserialize_cdr(data, TYPE)
-
-
-def record_decoder(bag: Bag) -> Callable[[Message], Any]:
-    """What decodes the records of a bag; it raises BagError for what is none."""
-    topic = bag.topics.get(SLOT_RECORD)
-    if topic is None or topic.type != TYPE:
-        return bag.decode
-    unpack = record_codec(topic.definition)
-
-    def decode(message: Message) -> Any:
-        try:
-            return unpack(message.data)
-        except (SerdeError, AssertionError, IndexError, KeyError, ValueError, struct.error) as error:
-            raise BagError(f"{SLOT_RECORD} at {message.log_time_ns} ns: not a valid {TYPE} ({error})") from None
-
-    return decode

@@ -1,13 +1,14 @@
 """Real agents of the core, stepped through a log: what they decide, and what they know of each other.
 
 Each agent is where the log says it was, and hears what the log says it heard; what it then decides and estimates
-follows. In lockstep everything follows from the configuration alone: vehicles and channel are stepped too.
+follows.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,65 +19,27 @@ from dtsa_agent.core.errors import RemoteProtocolError
 from dtsa_agent.core.frame import TAG_LENGTH, decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
-from dtsa_bench.runs.config import RunConfig
-from dtsa_bench.runs.hearing import Hearing
+from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import metrics_tables
-from dtsa_channel_sim import Channel
-from dtsa_channel_sim.model.verdict import Verdict
 
-from .arrays import NEW, PRESENT, UNRECORDED, FlightArrays, LogBuilder
+from .arrays import NEW, PRESENT, UNRECORDED, FlightArrays
 
-Changes = Mapping[int, Mapping[str, Any]]  # of the channel's settings, by the slot from which they hold
-
-
-class ReplayedSlot(NamedTuple):
-    """A slot at its end."""
-
-    row: int  # of the log
-    swarm: Swarm  # the agents: decisions of this slot, tables as they are now
-    verdict: Verdict | None  # in lockstep: the channel's
+_MAX_DIFFERENCES = 5  # kept of each replay
+_DECIDED = ("chosen", "reason", "digest", "score")
 
 
-def replay_lockstep(
-    config: RunConfig, slots: int, changes: Changes, log: LogBuilder, hearing: Hearing
-) -> Iterator[ReplayedSlot]:
-    """All agents of a flight in lockstep and their channel, from the configuration; the log receives what happens.
+class DecisionDifference(NamedTuple):
+    """What an agent decided in a slot, by its replay and by the log."""
 
-    Every agent keeps a table of its own, fed only by what the channel let it hear.
-    """
-    swarm = with_key(make_swarm(config.swarm, make_scenario(config.swarm)))
-    channel, ids = Channel(config.air), swarm.ids
-    for slot in range(slots):
-        if slot in changes:
-            channel.set(slot=slot, **changes[slot])
-        swarm.scenario.advance(slot, swarm)
-        frames = {ids[index]: swarm.frame(index) for index in swarm.begin(slot)}
-        log.open(swarm, frames)
-        senders = sorted(frames)
-        verdict = channel.arbitrate(slot, senders, [len(frames[sender]) for sender in senders], swarm.position)
-        log.close(verdict)
-        swarm.fly(slot)
-        mask = verdict.mask(len(ids))
-        hearing.slot(len(senders), mask)
-        for row, sender in enumerate(verdict.senders):
-            if swarm.hear(slot, frames[sender], None if verdict.received is None else mask[row].view(np.uint8)):
-                hearing.take_in(mask[row])
-        swarm.end(slot)
-        yield ReplayedSlot(slot, swarm, verdict)
-
-
-class HeardBy(NamedTuple):
-    """A frame that some of the agents heard."""
-
-    slot: int  # as its sender counts
-    data: bytes
-    by: NDArray[np.uint8] | None  # (n,) by whom; None: by all
+    slot: int  # as the agent counts
+    agent: int  # id
+    field: str  # chosen, reason, digest, score or frame
+    expected: Any  # bytes of a frame
+    recorded: Any
 
 
 class AgentReplay:
-    """Agents with clocks of their own that are where they said they were, and hear what they said they heard.
-
-    In each slot: :meth:`decide`, :meth:`complete`. Arrays have a column an agent (n).
+    """Agents with clocks of their own, replayed from a log, slot by slot.
 
     :param ids: the agents, which know nothing at first.
     :param tags: check the tags of frames; otherwise they are left out: whether they are right was the agents' to say.
@@ -84,95 +47,83 @@ class AgentReplay:
     """
 
     def __init__(self, config: SwarmConfig, ids: Sequence[int], tags: bool = False, goals_told: bool = False) -> None:
-        self._config, self._tags = config, tags
+        self._config, self._tag_length = config, TAG_LENGTH if config.auth and not tags else 0
         own = config if tags or not config.auth else dataclasses.replace(config, auth=False)
         swarm = make_swarm(own, make_scenario(own), local=list(ids))
         self.swarm = with_key(swarm) if tags else swarm
         if goals_told:
             swarm.final[:] = 0
-        self._group = AgentGroup(self.swarm)
+        self._group, self._columns = AgentGroup(self.swarm), np.array(ids, np.intp) - 1
+        self.equal = 0  # decisions, of an agent in a slot
+        self.differences: list[DecisionDifference] = []  # the first ones
+        self.unsent: dict[tuple[int, int], bytes] = {}  # frames that were made and not sent, by slot and agent
 
-    def decide(self, slot: int, state: AgentState, before: Sequence[HeardBy] = ()) -> None:
-        """Let the agents decide for a slot.
-
-        :param before: what agents that are new heard before it.
-        """
-        swarm = self.swarm
-        for local in np.flatnonzero(state.presence & NEW).tolist():
+    def step(self, log: FlightArrays, row: int) -> None:
+        """Replay a slot of which the log has the agents' accounts."""
+        swarm, at, slot = self.swarm, self._columns, log.first_slot + row
+        presence = np.full(len(at), PRESENT, np.uint8) if log.presence is None else log.presence[row, at]
+        for local in np.flatnonzero(presence & NEW).tolist():
             swarm.restart(local)
-        self._hear(before)
-        swarm.track[:], swarm.position[:] = state.track, state.track[-1]
-        swarm.velocity[:], swarm.command[:] = state.velocity, state.command
-        if state.goal is not None:
-            swarm.goal[:] = state.goal  # one that flies where it is told to has others than the scenario's
-        presence = state.presence & ~np.uint8(NEW)
-        swarm.present[presence != PRESENT] = presence[presence != PRESENT]
-        for local in state.leaving:
+        self._hear(log, row, before=True)
+        swarm.track[:], swarm.velocity[:] = log.track[row][:, :, at], log.velocity[row][:, at]
+        swarm.command[:], swarm.position[:] = log.command[row][:, at], swarm.track[-1]
+        if log.merged is not None:
+            swarm.goal[:] = log.goal[row][:, at]  # one that flies where it is told to has others than the scenario's
+        state = presence & ~np.uint8(NEW | UNRECORDED)
+        swarm.present[state != PRESENT] = state[state != PRESENT]
+        for local in self._leaving(log, row):
             swarm.leave(local)
         self._group.on_slot(slot)
-
-    def complete(self, silent: Sequence[int], heard: Sequence[HeardBy]) -> None:
-        """Let the agents hear what they heard in the slot, and close it.
-
-        :param silent: columns of those that did not send, or were too late to.
-        """
-        for local in silent:
-            self.swarm.drop(local)
-        self._hear(heard)
+        self._compare(log, row, slot)
+        for local in np.flatnonzero((log.length[row, at] == 0) & (presence & UNRECORDED == 0)).tolist():
+            swarm.drop(local)  # silent, or too late to send
+        self._hear(log, row, before=False)
         self._group.on_slot_end()
 
-    def _hear(self, heard: Sequence[HeardBy]) -> None:
-        tag = TAG_LENGTH if self._config.auth and not self._tags else 0
-        for slot, data, by in heard:
-            self.swarm.hear(slot, data[: len(data) - tag], by)
-
-
-class AgentState(NamedTuple):
-    """Where agents were at a slot's start; a column an agent (n)."""
-
-    track: NDArray[np.float64]  # (K, 3, n) m
-    velocity: NDArray[np.float64]  # (3, n) m/s
-    command: NDArray[np.float64]  # (3, n) m/s
-    goal: NDArray[np.float64] | None  # (3, n) m; None: those of the scenario
-    presence: NDArray[np.uint8]  # (n,) PRESENT or LEAVING, and NEW added
-    leaving: Sequence[int] = ()  # columns of those that say in this slot's frame that they leave
-
-
-def replay_log(log: FlightArrays, tags: bool) -> Iterator[tuple[int, Swarm]]:
-    """All agents of a log with clocks of their own, together, up to the first slot that one of them has not told of.
-
-    :param tags: check the tags of frames.
-    :returns: each row and the agents, when they have decided.
-    """
-    config, everybody = log.config.swarm, np.full(log.agents, PRESENT, np.uint8)
-    assert log.heard is not None
-    replay = AgentReplay(config, range(1, log.agents + 1), tags)
-    ends = np.searchsorted(log.heard.row, np.arange(len(log) + 1)).tolist()
-    silent = log.length == 0
-    if log.presence is not None:
-        silent &= (log.presence & UNRECORDED) == 0
-    for row in range(len(log)):
-        if not log.known[row].all():
+    def _hear(self, log: FlightArrays, row: int, before: bool) -> None:
+        heard = log.heard
+        if heard is None:
             return
-        leaving = [column for column in np.flatnonzero(log.length[row]).tolist() if _leaves(config, log, row, column)]
-        state = AgentState(log.track[row], log.velocity[row], log.command[row], None, everybody, leaving)
-        replay.decide(row, state)
-        yield row, replay.swarm
-        heard = [
-            HeardBy(int(log.heard.slot[k]), log.heard.data[k], log.heard.by[k].view(np.uint8))
-            for k in range(ends[row], ends[row + 1])
-        ]
-        replay.complete(np.flatnonzero(silent[row]).tolist(), heard)
+        for k in range(log.heard_ends[row], log.heard_ends[row + 1]):
+            by = heard.by[k, self._columns]
+            if heard.before[k] == before and by.any():
+                data = heard.data[k]
+                self.swarm.hear(int(heard.slot[k]), data[: len(data) - self._tag_length], by.view(np.uint8))
 
+    def _leaving(self, log: FlightArrays, row: int) -> list[int]:
+        """The agents that say in their frame that they leave: what made them leave came from outside."""
+        if log.merged is not None or not self._config.policy_row.says_leaving:
+            return []  # of a network their presence says so
+        sent = np.flatnonzero(log.length[row, self._columns]).tolist()
+        return [local for local in sent if self._says_leaving(log.frame(row, self.swarm.ids[local]))]
 
-def _leaves(config: SwarmConfig, log: FlightArrays, row: int, column: int) -> bool:
-    """Whether an agent says in a frame that it leaves: what made it leave came from outside."""
-    if not config.policy_row.says_leaving:
-        return False
-    try:
-        return decode_extended(config.protocol_part(log.frame(row, column + 1), sealed=True)).leaving
-    except RemoteProtocolError:
-        return False
+    def _says_leaving(self, frame: bytes) -> bool:
+        try:
+            return decode_extended(self._config.protocol_part(frame, sealed=True)).leaving
+        except RemoteProtocolError:
+            return False
+
+    def _compare(self, log: FlightArrays, row: int, slot: int) -> None:
+        """Compare what the agents decided for a slot, and their frames, with the log."""
+        swarm, at, found = self.swarm, self._columns, {}
+        for name in _DECIDED:
+            expected, recorded = getattr(swarm, name), getattr(log, name)[row, at]
+            if expected.tobytes() != recorded.tobytes():
+                for local in np.flatnonzero(expected.view(np.uint8) != recorded.view(np.uint8)).tolist():
+                    local //= expected.itemsize
+                    pair = expected[local].item(), recorded[local].item()
+                    found.setdefault(local, DecisionDifference(slot, swarm.ids[local], name, *pair))
+        for local in np.flatnonzero((swarm.sends > 0) | (log.length[row, at] > 0)).tolist():
+            agent, expected_frame = swarm.ids[local], swarm.frame(local) if swarm.sends[local] else b""
+            sent = log.frame(row, agent)
+            recorded_frame = sent[: len(sent) - self._tag_length]
+            if not sent:
+                self.unsent[slot, agent] = expected_frame
+            elif recorded_frame != expected_frame:
+                found.setdefault(local, DecisionDifference(slot, agent, "frame", expected_frame, recorded_frame))
+        self.equal += len(at) - len(found)
+        room = _MAX_DIFFERENCES - len(self.differences)
+        self.differences += [found[local] for local in sorted(found)[:room]]
 
 
 def knowledge_tables(log: FlightArrays) -> Swarm:
@@ -183,32 +134,67 @@ def knowledge_tables(log: FlightArrays) -> Swarm:
     return metrics_tables(config, scenario, everyone=not shared)
 
 
-def replay_tables(log: FlightArrays, tables: Swarm, hearing: Hearing | None = None) -> Iterator[int]:
+def replay_tables(log: FlightArrays, tables: Swarm, delivery: DeliveryCounts | None = None) -> Iterator[int]:
     """Feed what the agents received to their tables; yields each row at its end.
 
-    :param hearing: counts what was sent, arrived, and was taken in.
+    :param delivery: counts what was sent, arrived, and was taken in.
     """
     frames = log.sent_frames
     starts = np.searchsorted(frames.row, np.arange(len(log) + 1)).tolist()
-    entries = None if log.heard is None else np.searchsorted(log.heard.row, np.arange(len(log) + 1)).tolist()
     shared = len(tables.observer) == 1 and tables.observer[0] < 0
     scenario = log.scenario
     assert scenario is not None
     for row in range(len(log)):
         scenario.advance(row, tables)
-        if hearing is not None:
-            hearing.slot(starts[row + 1] - starts[row], frames.received[starts[row] : starts[row + 1]])
-        if log.heard is not None and entries is not None:
-            for k in range(entries[row], entries[row + 1]):
-                if tables.hear(int(log.heard.slot[k]), log.heard.data[k], log.heard.by[k].astype(np.uint8)) and hearing:
-                    hearing.take_in(log.heard.by[k])
+        if delivery is not None:
+            delivery.add_slot(starts[row + 1] - starts[row], frames.received[starts[row] : starts[row + 1]])
+        if log.heard is not None:
+            for k in range(log.heard_ends[row], log.heard_ends[row + 1]):
+                if tables.hear(int(log.heard.slot[k]), log.heard.data[k], log.heard.by[k].astype(np.uint8)) and delivery:
+                    delivery.add_accepted(log.heard.by[k])
         else:
             for k in range(starts[row], starts[row + 1]):
                 mask = None
                 if not shared:
                     mask = frames.received[k].astype(np.uint8)
                     mask[frames.sender[k] - 1] = 1  # who sends knows what it said
-                if tables.hear(row, frames.data[k], mask) and hearing is not None:
-                    hearing.take_in(frames.received[k])
+                if tables.hear(row, frames.data[k], mask) and delivery is not None:
+                    delivery.add_accepted(frames.received[k])
         tables.end(row)
         yield row
+
+
+# -- ages and errors --------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class MeanAges:
+    """By slot and agent: means over all observers that still have that agent in A_p; NaN without any."""
+
+    age: NDArray[np.float64]  # slots, (S, N)
+    error: NDArray[np.float64]  # m, (S, N)
+    observers: NDArray[np.int64]  # (S, N)
+    results: NDArray[np.bool_]  # (S,) slots that the means of a flight take
+
+    @classmethod
+    def empty(cls, slots: int, agents: int) -> MeanAges:
+        """Without an observer in any slot."""
+        shape = slots, agents
+        return cls(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.int64), np.zeros(slots, np.bool_))
+
+    def set_means(self, slot: int, counted: NDArray[Any], age: NDArray[Any], error: NDArray[Any]) -> None:
+        """Set the means of a slot from pairs of observers and agents: who counts, ages and errors, (V, N)."""
+        observers = self.observers[slot] = counted.sum(axis=0)
+        some = observers > 0
+        for mean, values in ((self.age, age), (self.error, error)):
+            mean[slot, some] = np.where(counted, values, 0).sum(axis=0)[some] / observers[some]
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedPairs:
+    """What each observer knew of each other agent that it had heard, at the end of one slot: P pairs."""
+
+    slot: int
+    observer: NDArray[np.int64]  # (P,) ids
+    agent: NDArray[np.int64]  # (P,) ids
+    age: NDArray[np.int64]  # slots, (P,)
+    error: NDArray[np.float64]  # m, (P,)
+    counted: NDArray[np.bool_]  # (P,) the observer still has it in A_p, and it moves

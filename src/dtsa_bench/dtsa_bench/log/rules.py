@@ -40,7 +40,7 @@ class HandedTurn:
 
 
 @dataclass(slots=True)
-class Ledger:
+class GrantLedger:
     """Who gave which turn to whom, and whether all kept to it.
 
     :param main_every: K M; 0: M.
@@ -85,7 +85,7 @@ class Ledger:
                     turns.append(turn)
         return turns[:room]
 
-    def slot(self, slot: int, frames: dict[int, bytes]) -> None:
+    def check_slot(self, slot: int, frames: dict[int, bytes]) -> None:
         """Takes in one slot."""
         given, handed = self.issued.pop(slot, []), self.handed.pop(slot, HandedTurn())
         owner = slot % self.agents + 1
@@ -95,24 +95,24 @@ class Ledger:
         if len(frames) > 1:
             self.open_collisions += is_open
             self.adopted_collisions += adopted and not is_open
-            taken_back = not is_open and not adopted and self._taken_back(slot, frames.get(owner))
-            forgotten = not is_open and not adopted and any(self._forgotten(handed, sender) for sender in frames)
-            self.anchor_collisions += taken_back
-            self.handed_collisions += forgotten and not taken_back
-            if not (is_open or adopted or taken_back or forgotten):
+            reclaimed = not is_open and not adopted and self._is_reclaimed(slot, frames.get(owner))
+            forgotten = not is_open and not adopted and any(self._has_forgotten(handed, sender) for sender in frames)
+            self.anchor_collisions += reclaimed
+            self.handed_collisions += forgotten and not reclaimed
+            if not (is_open or adopted or reclaimed or forgotten):
                 self.plain_collisions += 1
                 self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}, by now to {handed.holders}")
         for sender, data in frames.items():
             self._check_sender(slot, sender, owner, given, data, handed)
-            self.read(slot, sender, data)
+            self.note_frame(slot, sender, data)
 
-    def _taken_back(self, slot: int, data: bytes | None) -> bool:
+    def _is_reclaimed(self, slot: int, data: bytes | None) -> bool:
         """Whether the owner sends in an anchor, no main one, in probation: it may have given it away before."""
         if data is None or not self._is_anchor(slot) or self._is_main(slot):
             return False
         return decode_extended(data).probation
 
-    def _forgotten(self, handed: HandedTurn, sender: int) -> bool:
+    def _has_forgotten(self, handed: HandedTurn, sender: int) -> bool:
         """Whether a sender handed the turn on before it restarted: what others relay may be all that it knows."""
         return self.quiet.get(sender, -1) > handed.handed_on.get(sender, self._NEVER)
 
@@ -120,14 +120,14 @@ class Ledger:
         self, slot: int, sender: int, owner: int, given: list[tuple[int, int]], data: bytes, handed: HandedTurn
     ) -> None:
         last = handed.holders
-        if sender in last or OPEN in last or self._forgotten(handed, sender):
+        if sender in last or OPEN in last or self._has_forgotten(handed, sender):
             return
         if sender != owner:
             self.broken.append(f"slot {slot}: agent {sender} sends in a turn of {owner} given to {sorted(last)}")
-        elif any(issuer == owner for issuer, _ in given) and not self._taken_back(slot, data):
+        elif any(issuer == owner for issuer, _ in given) and not self._is_reclaimed(slot, data):
             self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(last)}")
 
-    def read(self, slot: int, sender: int, data: bytes) -> None:
+    def note_frame(self, slot: int, sender: int, data: bytes) -> None:
         """Takes note of what a frame gives away, whether or not it got on the air."""
         try:
             frame = decode_extended(data)
@@ -176,7 +176,7 @@ class Ledger:
         handed.handed_on.setdefault(sender, slot)
 
 
-class Judge:
+class RuleChecker:
     """Reads the frames of a swarm slot by slot.
 
     What was given away before it began it cannot know: unless it begins with slot 0, it only listens for as long as
@@ -186,16 +186,16 @@ class Judge:
     def __init__(self, config: SwarmConfig) -> None:
         self._config = config
         rounds = config.anchor_every, config.main_every
-        self._ledger = Ledger(config.agents, *rounds) if config.policy == "lease" else None
+        self._ledger = GrantLedger(config.agents, *rounds) if config.policy == "lease" else None
         self._window = (config.main_every + 2) * config.agents if self._ledger else 0
         self._from: int | None = None  # slot
         self.broken: list[str] = []
         self._known_from = 0  # slot from which on no turn depends on a frame that nobody has recorded
         self.slots = self.frames = 0
-        self.unjudged = 0  # slots that may depend on such a frame
-        self.double = 0  # slots with two senders or more
+        self.unchecked = 0  # slots that may depend on such a frame
+        self.double_slots = 0  # slots with two senders or more
 
-    def slot(
+    def check_slot(
         self,
         slot: int,
         frames: Mapping[int, bytes],
@@ -210,9 +210,9 @@ class Judge:
             self._from = slot + self._window if slot else 0
         if self._ledger is not None:
             said = {agent: self._config.protocol_part(data, sealed=True) for agent, data in frames.items()}
-            self._ledger.slot(slot, said)
+            self._ledger.check_slot(slot, said)
             for agent, data in (unsent or {}).items():
-                self._ledger.read(slot, agent, self._config.protocol_part(data))
+                self._ledger.note_frame(slot, agent, self._config.protocol_part(data))
             found, self._ledger.broken = self._ledger.broken, []
         else:
             found = self._turns(slot, frames)
@@ -221,11 +221,11 @@ class Judge:
         if slot < self._from:
             return
         if found and slot < self._known_from:
-            self.unjudged += 1
+            self.unchecked += 1
             return
         self.slots += 1
         self.frames += len(frames)
-        self.double += len(frames) > 1
+        self.double_slots += len(frames) > 1
         self.broken += found
 
     def _turns(self, slot: int, frames: Mapping[int, bytes]) -> list[str]:
@@ -236,7 +236,7 @@ class Judge:
         return [f"slot {slot}: agent {agent} sends in a turn of {owner}" for agent in frames if agent != owner]
 
     @property
-    def knows_rules(self) -> bool:
+    def has_rules(self) -> bool:
         """Whether the policy has rules that frames alone can break."""
         return self._ledger is not None or self._config.policy == "tdma"
 
@@ -251,9 +251,9 @@ class Judge:
         }  # fmt: skip
         return {
             "slots_judged": self.slots,
-            "slots_not_judged": self.unjudged,
+            "slots_not_judged": self.unchecked,
             "frames_judged": self.frames,
-            "slots_with_two_senders": self.double,
+            "slots_with_two_senders": self.double_slots,
             **shared,
             "rules_broken": len(self.broken),
             "which": self.broken[:_TOLD],

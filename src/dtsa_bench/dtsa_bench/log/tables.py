@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.registry import REASON_TEXTS, REASONS
+from dtsa_bench.runs.options import check_free
 from dtsa_channel_sim.model.verdict import OUTCOMES
 
 from .arrays import FlightArrays, extent_of
 from .bag.errors import BagError
 from .knowledge import knowledge_of, observed, why_without_ages
+from .replay import ObservedPairs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,10 +113,8 @@ def table(log: FlightArrays, name: str) -> pd.DataFrame:
     :raises ConfigError: if pandas is missing.
     """
     pandas = _pandas()
-    blocks = list(_BUILDERS[name](log))
-    return pandas.DataFrame(blocks[0]) if len(blocks) == 1 else pandas.concat(
-        [pandas.DataFrame(block) for block in blocks], ignore_index=True
-    )  # fmt: skip
+    frames = [pandas.DataFrame(block) for block in _BUILDERS[name](log)]
+    return frames[0] if len(frames) == 1 else pandas.concat(frames, ignore_index=True)
 
 
 def _masked(values: Any, unknown: Any) -> Any:
@@ -240,29 +240,26 @@ def _ages(log: FlightArrays) -> Iterator[Block]:
     }
 
 
+_OF_PAIRS: dict[str, tuple[str, Any]] = {  # columns, of which field of ObservedPairs, and of which kind
+    "observer": ("observer", np.int64), "agent": ("agent", np.int64), "age_slots": ("age", np.int64),
+    "error_m": ("error", np.float64), "counted": ("counted", np.bool_),
+}  # fmt: skip
+
+
 def _ages_by_observer(log: FlightArrays) -> Iterator[Block]:
-    waiting, rows, is_first = [], 0, True
-
-    def block() -> Block:
-        parts = [np.zeros(0, np.int64)] if not waiting else [np.full(len(seen.agent), seen.slot) for seen in waiting]
-        slot = np.concatenate(parts)
-        kinds = {"observer": np.int64, "agent": np.int64, "age": np.int64, "error": np.float64, "counted": np.bool_}
-        columns = {
-            name: np.concatenate([np.zeros(0, kind), *(getattr(seen, name) for seen in waiting)])
-            for name, kind in kinds.items()
-        }
-        columns = {"age_slots" if name == "age" else "error_m" if name == "error" else name: values
-                   for name, values in columns.items()}  # fmt: skip
-        return {"slot": slot, "time_s": log.time_s(slot + 1), **columns}
-
-    for seen in observed(log):
-        waiting.append(seen)
-        rows += len(seen.agent)
-        if rows >= ROWS:
-            yield block()
+    waiting: list[ObservedPairs] = []
+    rows, is_first = 0, True
+    for pairs in chain(observed(log), [None]):
+        if pairs is not None:
+            waiting.append(pairs)
+            rows += len(pairs.agent)
+        if rows >= ROWS or (pairs is None and (rows or is_first)):
+            slot = np.concatenate([np.zeros(0, np.int64), *(np.full(len(part.agent), part.slot) for part in waiting)])
+            yield {"slot": slot, "time_s": log.time_s(slot + 1), **{
+                name: np.concatenate([np.zeros(0, kind), *(getattr(part, field) for part in waiting)])
+                for name, (field, kind) in _OF_PAIRS.items()
+            }}  # fmt: skip
             waiting, rows, is_first = [], 0, False
-    if rows or is_first:
-        yield block()
 
 
 def _distances(log: FlightArrays) -> Iterator[Block]:
@@ -281,8 +278,7 @@ _BUILDERS: Mapping[str, Callable[[FlightArrays], Iterator[Block]]] = {
 
 
 # -- files -----------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class ExportedTable:
+class ExportedTable(NamedTuple):
     """One table that was written."""
 
     path: Path
@@ -311,8 +307,7 @@ def export(
         if name not in COLUMNS:
             raise ConfigError("tables", name, ", ".join(COLUMNS))
     target = Path(directory)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise ConfigError("out", str(directory), "a directory that is empty or does not exist yet")
+    check_free(target)
     flight = log() if callable(log) else log
     # Written to a directory of its own, and moved to their places when all are whole.
     new, part = not target.exists(), target / ".part"
@@ -322,11 +317,8 @@ def export(
         for name in COLUMNS if tables is None else [name for name in COLUMNS if name in tables]:
             file = f"{name}.{kind}"
             written.append(ExportedTable(target / file, _write(part / file, kind, name, _BUILDERS[name](flight))))
-        if (
-            note
-            and (tables is None or {"ages", "ages_by_observer"} & set(tables))
-            and (why := why_without_ages(flight))
-        ):
+        has_ages = tables is None or {"ages", "ages_by_observer"} & set(tables)
+        if note and has_ages and (why := why_without_ages(flight)):
             note(why)
         (part / "columns.md").write_text(describe(), encoding="utf-8")
         for whole in sorted(part.iterdir()):

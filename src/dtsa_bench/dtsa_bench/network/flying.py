@@ -74,13 +74,13 @@ def fly(job: AgentJob) -> int:
             with recorded(job.out, agent, job.port) as recorder:
                 agent.run(stop)
             summary, failure = recorder.summary, recorder.failure
-    from dtsa_bench.runs.hearing import of_datagrams
+    from dtsa_bench.runs.delivery import counts_of_datagrams
 
     terminal.clear()
     print(json.dumps(summary, indent=2) if job.as_json else brief(summary))
     not_taken_in = summary["not_taken_in"]
     # Two: this agent, and all others.
-    hearing = of_datagrams(2, summary["slots"], summary["sent"], summary["heard"], not_taken_in)
+    hearing = counts_of_datagrams(2, summary["slots"], summary["sent"], summary["heard"], not_taken_in)
     problem = hearing.problem(not_taken_in) if hearing.delivered else ""  # who is alone hears nobody
     problem = problem or summary["never_flew"]
     if problem:

@@ -20,7 +20,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.stop import Stop
 from dtsa_bench.log.agent_bag import RecordFile
 from dtsa_bench.log.record import SNIFFER, frame_fields, pack_record
-from dtsa_bench.log.rules import Judge
+from dtsa_bench.log.rules import RuleChecker
 from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS
 
 _PATIENCE_S = 0.05
@@ -41,10 +41,11 @@ class Sniffer:
         self, config: SwarmConfig, port: PortSettings, path: Path | None = None,
         log: Callable[[str], None] | None = None,
     ) -> None:  # fmt: skip
-        self._config, self._judge = config, Judge(config)
+        self._config, self._rules = config, RuleChecker(config)
         self._datagrams = StationSettings(config, link_of(config, port.properties), authenticator(config))
         self._slots: dict[int, dict[int, tuple[int, bytes]]] = {}  # not judged yet: by sender, when it came, and what
         self._judged = -1  # last slot
+        self._recorded_ns = 0  # when it was recorded to start
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
         self._zero_ns = time.monotonic_ns()
@@ -82,12 +83,13 @@ class Sniffer:
             self._judged = over
 
     def _close_slot(self, slot: int) -> None:
-        """Judge a slot, and record it: its time is that of the first frame that was heard in it."""
+        """Check a slot, and record it: its time is that of the first frame that was heard in it."""
         heard = dict(sorted(self._slots.pop(slot).items()))
         frames = {sender: data for sender, (_, data) in heard.items()}
-        self._judge.slot(slot, frames)
+        self._rules.check_slot(slot, frames)
         if self.bag is not None:
-            first_ns = min(at_ns for at_ns, _ in heard.values())
+            # An old frame may have been sent again: records have their times in the order in which they are written.
+            first_ns = self._recorded_ns = max(self._recorded_ns, min(at_ns for at_ns, _ in heard.values()))
             at, nothing = first_ns - self._zero_ns + names.TIME_ZERO_NS, [0] * len(heard)
             outcome = COLLISION if len(heard) > 1 else SUCCESS
             self.bag.write(at, pack_record(
@@ -110,7 +112,7 @@ class Sniffer:
             "heard": {f"cf{agent}": count for agent, count in sorted(self.heard.items())},
             "not_taken_in": dict(sorted(self.refused.items())),
             **self._listener.counts(),
-            **self._judge.summary(),
+            **self._rules.summary(),
         }
 
     def close(self) -> None:

@@ -66,7 +66,7 @@ def _offer(group: Any, setting: Setting, section: str, prefix: str, skip: tuple[
         _add(group, setting, section, prefix)
 
 
-def given(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
+def given_options(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
     """The values of those options of :func:`add_options` that were given, by name.
 
     :raises ConfigError: for a text that is no value of its setting's kind.
@@ -104,16 +104,16 @@ def run_config(args: argparse.Namespace, **fixed: Any) -> RunConfig:
 
     :raises ConfigError: naming the option, the value and what is allowed.
     """
-    values = {section: given(args, cls, section) for section, cls, _ in _SECTIONS}
+    values = {section: given_options(args, cls, section) for section, cls, _ in _SECTIONS}
     swarm = SwarmConfig.from_dict({**values["swarm"], **fixed})
     derived = from_swarm(swarm)
     if getattr(args, "channel", None):
         channel = ChannelConfig.from_yaml(args.channel, **values["channel"], **derived)
     else:
         channel = ChannelConfig.from_dict({**values["channel"], **derived})
-    clocks = ClockConfig(seed=swarm.seed, **given(args, ClockConfig, "clocks"))
+    clocks = ClockConfig(seed=swarm.seed, **given_options(args, ClockConfig, "clocks"))
     limits = RunLimits(**values["limits"])
-    return RunConfig(swarm, channel, limits, clocks=clocks, **given(args, RunConfig, "run"))
+    return RunConfig(swarm, channel, limits, clocks=clocks, **given_options(args, RunConfig, "run"))
 
 
 def whole_number(text: str, name: str, minimum: int, maximum: int) -> int:

@@ -7,20 +7,17 @@ for bit.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm, make_scenario
-from dtsa_agent.core.frame import named_in
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
-from dtsa_bench.log.arrays import HeardFrames
-from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics, may_share
 from dtsa_channel_sim import Channel, Verdict
@@ -32,8 +29,17 @@ from .unslotted import UnslottedTraffic
 _CALL_S = 0.02  # a call of C takes about so long: after it, Ctrl-C works
 
 
+class AcceptedFrame(NamedTuple):
+    """A frame that agents accepted, in a flight of agents that send at any instant."""
+
+    row: int  # slot in which they did
+    slot: int  # of the state in it
+    data: bytes
+    by: NDArray[np.bool_]  # (N,) by whom
+
+
 @dataclass(frozen=True, slots=True)
-class Flight:
+class SimulatedFlight:
     """A simulated flight."""
 
     run: RunConfig
@@ -42,37 +48,13 @@ class Flight:
     swarm: Swarm  # as it was at the end
     log: SlotArrays | None  # what happened in its slots
     wall_time_s: float
-    heard: HeardFrames | None = None  # in a log of agents that send at any instant
+    accepted: list[AcceptedFrame] | None = None  # in a log of agents that send at any instant
 
     def summary(self) -> dict[str, Any]:
         """The results, with the keys of ``summary.json``."""
         result = self.metrics.summary(self.wall_time_s)
         result["malformed"], result["foreign"] = self.swarm.malformed, self.swarm.foreign
         return result
-
-    def to_log(self) -> FlightLog:
-        """What happened, and what follows from it; the flight was simulated with its log and its frames."""
-        arrays, config, heard = self.log, self.run.swarm, self.heard
-        assert arrays is not None
-        slots = len(arrays)
-        start = np.broadcast_to(self.scenario.start, (1, *arrays.position.shape[1:]))
-        received = arrays.received
-        if heard is not None:  # who took a frame in that arrived, received its sender's
-            received = received.copy()
-            place = np.cumsum(arrays.sent).reshape(arrays.sent.shape) - 1
-            for row, data, by in zip(heard.row.tolist(), heard.data, heard.by, strict=True):
-                sender, slot = named_in(data) or (0, 0)
-                if 0 < sender <= config.agents and slot <= row and arrays.sent[slot, sender - 1]:
-                    received[place[slot, sender - 1]] |= by
-        return FlightLog(
-            name="", settings=self.run.to_dict(), agents=config.agents, slot_ns=config.slot_ns,
-            recorded=np.ones(slots, np.bool_), known=np.ones(arrays.sent.shape, np.bool_),
-            start_ns=np.arange(slots) * config.slot_ns, outcome=arrays.outcome, length=arrays.length,
-            data=arrays.data.tobytes(), received=received, lost=arrays.lost, collided=arrays.collided,
-            chosen=arrays.chosen, reason=arrays.reason, digest=arrays.digest, score=arrays.score,
-            offset_ns=np.zeros(arrays.sent.shape, np.int64), track=np.concatenate((start, arrays.position)),
-            velocity=arrays.velocity, command=arrays.command, goal=arrays.goal, heard=heard, results=self.summary(),
-        )  # fmt: skip
 
 
 def simulate(
@@ -82,7 +64,10 @@ def simulate(
     log: bool = False,
     frames: bool = False,
     observer: int = 0,
-) -> Flight:
+    slots: int | None = None,
+    changes: Mapping[int, Mapping[str, Any]] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> SimulatedFlight:
     """Flies one run.
 
     :param run: the run.
@@ -90,20 +75,25 @@ def simulate(
     :param log: keep what happened in every slot.
     :param frames: keep the bytes of frames in it, too.
     :param observer: id of the agent whose knowledge the log has; 0: none.
+    :param slots: fly so many, whether or not the flight is over by then; None: until it is over.
+    :param changes: of the channel's settings, by the first slot in which they hold.
+    :param progress: is called with the next slot now and then.
     """
     begun = time.perf_counter()
     scenario = make_scenario(run.swarm)
     shared = may_share(run) if shared_table is None else shared_table
     swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared))
     writer = SlotWriter(swarm, observer, frames) if log else None
-    metrics = FlightMetrics(run, scenario)
-    heard: HeardFrames | None = None
+    metrics, channel = FlightMetrics(run, scenario), Channel(run.air)
+    for slot, values in sorted((changes or {}).items()):
+        channel.set(slot=slot, **values)
+    accepted: list[AcceptedFrame] | None = None
     if run.swarm.policy_row.unslotted:
-        heard = _fly_unslotted(swarm, Channel(run.air), metrics, writer)
+        accepted = _fly_unslotted(swarm, channel, metrics, writer)
     else:
-        _fly(swarm, Channel(run.air), metrics, writer)
+        _fly(swarm, channel, metrics, writer, slots, progress)
     arrays = None if writer is None else writer.finish()
-    return Flight(run, scenario, metrics, swarm, arrays, time.perf_counter() - begun, heard)
+    return SimulatedFlight(run, scenario, metrics, swarm, arrays, time.perf_counter() - begun, accepted)
 
 
 def complete_slot(
@@ -121,8 +111,15 @@ def complete_slot(
     return verdict, metrics.update(slot, swarm.track, swarm, verdict.outcome, lengths)
 
 
-def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None) -> None:
-    """Fly slots until the flight is over: in C as far as agents and channel are built in and simple."""
+def _fly(
+    swarm: Swarm,
+    channel: Channel,
+    metrics: FlightMetrics,
+    log: SlotWriter | None,
+    slots: int | None,
+    progress: Callable[[int], None] | None,
+) -> None:
+    """Fly slots, until the flight is over or a number of them: in C as far as agents and channel are simple."""
     flight, received = ffi.new("sim_flight *"), ffi.new("uint8_t[]", swarm.config.agents)
     flight.swarm, flight.metrics, flight.received = swarm.kernel, metrics.kernel, received
     flight.course = ffi.NULL if swarm.course is None else swarm.course.kernel
@@ -131,15 +128,17 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
     if swarm.course is None:
         swarm.scenario.advance(0, swarm)  # once and for all
     whole, length, count, until = swarm.all_in_c, swarm.config.frame_length, 1, 0
-    while not metrics.end:
+    while not metrics.end if slots is None else flight.slot < slots:
         slot = flight.slot
+        if progress is not None:
+            progress(slot)
         if whole and slot >= until:
             until = channel.fill_losses(slot, flight.losses)
         if slot < until:
             if log is not None:
                 log.make_room()
             begun = time.perf_counter()
-            lib.dtsa_sim_run(flight, min(count, until - slot))
+            lib.dtsa_sim_run(flight, min(count, until - slot, until if slots is None else slots - slot))
             spent = time.perf_counter() - begun
             count = max(1, min(4 * count, int((flight.slot - slot) * _CALL_S / max(spent, 1e-6))))
         else:
@@ -158,10 +157,10 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter
 
 def _fly_unslotted(
     swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None
-) -> HeardFrames | None:
+) -> list[AcceptedFrame] | None:
     """The same for agents that send at any instant: what arrives in a slot is heard in it; with a log: what was."""
     traffic = UnslottedTraffic(swarm, channel)
-    heard: list[tuple[int, int, bytes, NDArray[np.bool_]]] = []  # row and slot, data, by, as in HeardFrames
+    accepted: list[AcceptedFrame] = []
     slot, over = 0, ""
     while not over:
         swarm.scenario.advance(slot, swarm)
@@ -174,16 +173,11 @@ def _fly_unslotted(
         for at, frame, mask in (*arrived, *carried.combined):
             swarm.hear(at, frame, mask)
             if log is not None:
-                heard.append((slot, at, frame, mask))
+                accepted.append(AcceptedFrame(slot, at, frame, mask))
         swarm.end(slot)
         over = metrics.update(slot, swarm.track, swarm, carried.outcome, carried.lengths)
         if log is not None:
             nothing = (0,) * len(carried.senders)
             log.close_slot(slot, Verdict(carried.outcome, carried.senders, None, nothing, nothing))
         slot += 1
-    if log is None:
-        return None
-    row, taken_as = (np.array([entry[k] for entry in heard], np.int64) for k in (0, 1))
-    by = np.array([mask for *_, mask in heard], np.bool_).reshape(len(heard), len(swarm.ids))
-    none = np.zeros(len(heard), np.int64)
-    return HeardFrames(row, none, taken_as, none, by, none.astype(np.bool_), [data for _, _, data, _ in heard])
+    return None if log is None else accepted

@@ -28,7 +28,7 @@ _MOST_LISTENS = 10_000  # for one frame
 
 
 @dataclass(slots=True)
-class Carried:
+class SlotTraffic:
     """What the air carried in one slot."""
 
     senders: tuple[int, ...] = ()  # ids that began to send a frame in it, each once
@@ -48,7 +48,7 @@ class _Packet(NamedTuple):
     to: int = 0  # id of the one agent that takes the frame in; 0: all
 
 
-class Radios:
+class ListeningRadios:
     """Radios that listen before they send: each holds one frame until its policy's ``sensed`` says that it may begin.
 
     The medium says whether the air is in use where a radio is: range, hidden senders, the turn-round to sending.
@@ -128,7 +128,7 @@ class UnslottedTraffic:
         self._airtime = channel.config.airtime
         self._air: Air[int] = Air(channel)
         row = swarm.config.policy_row
-        self._radios = Radios(self._air, swarm.policies) if row.listens else None
+        self._radios = ListeningRadios(self._air, swarm.policies) if row.listens else None
         self._reacts = row.reacts
         self._wakes = [(0, index) for index in range(len(swarm.ids))]
         heapify(self._wakes)
@@ -138,22 +138,22 @@ class UnslottedTraffic:
         self._on_air: dict[int, _Packet] = {}
         self._arriving: list[tuple[int, int, _Packet, NDArray[np.bool_]]] = []  # heap by arrival
         self._frames: list[bytes] = []
-        self._carried = Carried()
+        self._carried = SlotTraffic()
         self._began: set[int] = set()
 
-    def slot(self, slot: int) -> Carried:
+    def slot(self, slot: int) -> SlotTraffic:
         """Everything that happens on the air in a slot; tables are as they were when it began.
 
         :param slot: its number; slots come one after the other.
         """
         swarm, end_ns = self._swarm, (slot + 1) * self._slot_ns
-        self._carried, self._began = Carried(), set()
+        self._carried, self._began = SlotTraffic(), set()
         swarm.sends[:] = swarm.present > 0
         swarm.emit(slot)
         self._frames = [swarm.frame(index) for index in range(len(swarm.ids))]
         self._act(end_ns)
-        self._settle(end_ns)
-        self._take_in(end_ns)
+        self._resolve(end_ns)
+        self._deliver(end_ns)
         self._carried.senders = tuple(swarm.ids[index] for index in sorted(self._began))
         swarm.sends[:] = 0
         swarm.sends[sorted(self._began)] = 1
@@ -167,9 +167,9 @@ class UnslottedTraffic:
             heard = self._radios.next if self._radios is not None else (NEVER, 0)
             next_ns = min(wake, heard)[0]
             if self._reacts and self._air.due_ns <= min(next_ns, end_ns):
-                self._settle(self._air.due_ns)
+                self._resolve(self._air.due_ns)
             elif self._reacts and self._arriving and self._arriving[0][0] <= min(next_ns, end_ns - 1):
-                self._take_in(self._arriving[0][0])
+                self._deliver(self._arriving[0][0])
             elif next_ns >= end_ns:
                 return
             elif heard[0] < NEVER and (heard[0], heard[1] - 1) < wake:
@@ -273,7 +273,7 @@ class UnslottedTraffic:
         if not 1 <= length <= self._airtime.longest:
             policy = self._swarm.policies[index].name
             raise PluginError(f"{policy}, wake", f"sent {length} bytes; allowed: 1 to {self._airtime.longest}")
-        self._settle(now_ns)
+        self._resolve(now_ns)
         self._count += 1
         self._air.begin(self._count, packet.sender, at_ns, length)
         self._free_ns[index] = at_ns + self._airtime.total_ns(length)
@@ -282,7 +282,7 @@ class UnslottedTraffic:
             self._began.add(index)
         self._carried.lengths.append(length)
 
-    def _settle(self, until_ns: int) -> None:
+    def _resolve(self, until_ns: int) -> None:
         for verdict in self._air.resolve(until_ns, self._swarm.position):
             packet = self._on_air.pop(verdict.frame_id)
             if verdict.received.any():
@@ -292,7 +292,7 @@ class UnslottedTraffic:
             else:
                 self._carried.outcome = SUCCESS
 
-    def _take_in(self, until_ns: int) -> None:
+    def _deliver(self, until_ns: int) -> None:
         """What has arrived is heard; policies that react do so."""
         while self._arriving and self._arriving[0][0] <= until_ns:
             now_ns, _, packet, received = heappop(self._arriving)

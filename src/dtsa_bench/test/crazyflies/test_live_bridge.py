@@ -31,7 +31,7 @@ from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.keys import VARIABLE
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.log.agent_bag import read
-from dtsa_bench.log.merge.merge import Merge, verified
+from dtsa_bench.log.merge.merge import Merge, is_verified
 
 pytestmark = [
     pytest.mark.slow, pytest.mark.ros, pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler"),
@@ -120,6 +120,6 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to
     assert listener.returncode == 0
     assert all(heard["heard"][name] > 50 for name in NAMES)
     assert heard["rules_broken"] == 0
-    found = Merge([read(tmp_path / f"{name}.mcap") for name in NAMES]).judge()
-    assert verified(found)
+    found = Merge([read(tmp_path / f"{name}.mcap") for name in NAMES]).summary()
+    assert is_verified(found)
     assert found["decisions_again"]["differences"] == []

@@ -18,7 +18,7 @@ from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import FIRMWARE, compiler
 from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
 from dtsa_bench.log.agent_bag import read
-from dtsa_bench.log.merge.merge import Merge, verified
+from dtsa_bench.log.merge.merge import Merge, is_verified
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 
@@ -28,7 +28,7 @@ LEASE = SwarmConfig(agents=5, policy="lease")
 
 
 def merged(folder: Path) -> dict[str, Any]:
-    return Merge([read(path) for path in sorted(folder.glob("cf*.mcap"))]).judge()
+    return Merge([read(path) for path in sorted(folder.glob("cf*.mcap"))]).summary()
 
 
 @pytest.mark.parametrize(("swarm", "lab"), [
@@ -42,7 +42,7 @@ def test_apps_decide_what_agents_on_computers_decide(swarm: SwarmConfig, lab: La
         flight.lab.run(11.5)
         summary = flight.finish()
     found = merged(tmp_path)
-    assert verified(found)
+    assert is_verified(found)
     assert found["decisions_again"]["differences"] == []
     assert found["decisions_again"]["equal"] > 600 * swarm.agents
     assert found["turns"]["slots_with_two_senders"] == 0

@@ -29,7 +29,7 @@ from dtsa_bench.drawing.palette import (
     rgb,
 )
 from dtsa_bench.log.bag.cdr import MarkerPacker
-from dtsa_bench.pages.report.page import render
+from dtsa_bench.pages.report.data import render
 
 # From linear RGB to linear RGB as seen without one kind of cone (Machado, Oliveira, Fernandes 2009, severity 1).
 SIGHT = {

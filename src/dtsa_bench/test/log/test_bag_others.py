@@ -162,7 +162,6 @@ def test_topics_that_cannot_be_decoded_spoil_no_others(run: SyntheticRun, tmp_pa
             recover(path, bag)
         with Bag(bag) as opened:
             assert len(list(opened.typed(["/cf1/odom", "/swarm/decision"]))) == 80
-            assert len(opened.columns("/cf2/odom")["log_time_ns"]) == 40
             for topic, reason in (
                 ("/setbool_event", "definition cannot be used"),
                 ("/odd", "definition cannot be used"),
@@ -170,10 +169,9 @@ def test_topics_that_cannot_be_decoded_spoil_no_others(run: SyntheticRun, tmp_pa
                 ("/notes", "recorded as json/jsonschema"),
                 ("/raw", "recorded as raw/no schema"),
             ):
-                for use in (opened.columns, lambda name, bag=opened: next(bag.typed([name]))):
-                    with pytest.raises(UnusableBag, match=f"topic {topic}.*{reason}") as caught:
-                        use(topic)
-                    assert "\n" not in str(caught.value)
+                with pytest.raises(UnusableBag, match=f"topic {topic}.*{reason}") as caught:
+                    next(opened.typed([topic]))
+                assert "\n" not in str(caught.value)
         assert cli.main(["export", str(bag), "--out", str(tmp_path / f"{bag.name}_tables")]) == 0
     old, new = (channels_of(file) for file in (path, tmp_path / "new" / "new_0.mcap"))
     assert old == new

@@ -1,15 +1,11 @@
-"""Reading back: order, selection, decoding, columns, and bags that are none."""
+"""Reading back: order, selection, decoding, and bags that are none."""
 
 from __future__ import annotations
 
-import random
-from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-from bag_helpers import RUN, SECOND, SyntheticRun, cdr, definition, header, synthetic_bag, typestore
+from bag_helpers import SECOND, SyntheticRun, definition, synthetic_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -17,7 +13,6 @@ from mcap.writer import Writer
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.bag import metadata
-from dtsa_bench.log.bag.columns import Table
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
@@ -25,7 +20,6 @@ from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.runs.config import RunConfig
 
 RECEPTION = "dtsa_msgs/msg/Reception"
-DECISION = "dtsa_msgs/msg/Decision"
 
 
 @pytest.fixture(scope="module")
@@ -79,73 +73,10 @@ def test_damaged_message_bytes_are_an_error_that_names_the_message(run: Syntheti
         for size in range(len(whole.data) - 4):
             with pytest.raises(BagError, match="/swarm/decision at 1"):
                 bag.decode(whole._replace(data=whole.data[:size]))
-        for size in random.Random(3).sample(range(len(whole.data) - 4), 20):
-            table = Table(bag.typestore, whole.type)
-            table.add(SECOND, SECOND, whole.data[:size])
-            with pytest.raises(BagError, match="cannot be decoded"):
-                table.finish()
         huge = bytearray(whole.data)
         huge[16:20] = b"\xff\xff\xff\x7f"  # the length of the first sequence
         with pytest.raises(BagError, match="/swarm/decision"):
             bag.decode(whole._replace(data=bytes(huge)))
-
-
-def check_columns(columns: dict[str, np.ndarray], typed: list[Any]) -> None:
-    for name, values in columns.items():
-        if not name.endswith("_time_ns"):
-            for value, message in zip(values, typed, strict=True):
-                assert np.array_equal(value, attrgetter(name)(message)), name
-
-
-@pytest.mark.parametrize("topic", ["/swarm/slot", "/swarm/transmission", "/swarm/decision", "/cf2/odom"])
-def test_columns_are_what_decoding_gives(run: SyntheticRun, topic: str) -> None:
-    with Bag(run.writer.directory) as bag:
-        typed = [message for _, message in bag.typed([topic])]
-        columns = bag.columns(topic)
-    assert columns["log_time_ns"].tolist() == [row[0] for row in run.written[topic]]
-    assert columns["publish_time_ns"].tolist() == [row[1] for row in run.written[topic]]
-    check_columns(columns, typed)
-    store = typestore()
-    names = {name.split(".")[0] for name in columns} - {"log_time_ns", "publish_time_ns"}
-    assert names == {name for name, _ in store.fielddefs[type(typed[0]).__msgtype__][1]}
-
-
-DECISIONS = st.lists(
-    st.tuples(
-        st.lists(st.integers(0, 2**16 - 1), max_size=5),
-        st.lists(st.text(max_size=4).filter(lambda text: "\0" not in text), max_size=3),
-        st.lists(st.floats(allow_nan=False), max_size=4),
-        st.lists(st.integers(0, 255), max_size=9),
-    ),
-    max_size=25,
-)
-
-
-@settings(max_examples=60, deadline=None)
-@given(DECISIONS)
-def test_columns_of_changing_lengths(rows: list[tuple[list[int], list[str], list[float], list[int]]]) -> None:
-    store, typed = typestore(), []
-    table = Table(store, DECISION)
-    for slot, (ids, texts, scores, reasons) in enumerate(rows):
-        data = cdr(
-            DECISION, header=header(SECOND), run=RUN, slot=slot, agent=np.array(ids, np.uint16),
-            chosen=np.array(ids[::-1], np.uint16), reason_name=texts, reason_index=np.array(reasons, np.uint8),
-            reason=np.array([], np.uint8), digest=np.array(reasons, np.uint32), score=np.array(scores),
-        )  # fmt: skip
-        typed.append(store.deserialize_cdr(data, DECISION))
-        table.add(SECOND + slot, SECOND, data)
-    columns = table.finish()
-    assert len(columns["log_time_ns"]) == len(rows)
-    check_columns(columns, typed)
-
-
-def test_columns_may_be_chosen_and_come_for_many_topics_at_once(run: SyntheticRun) -> None:
-    with Bag(run.writer.directory) as bag:
-        found = bag.tables(["/cf1/odom", "/cf3/odom"], ["pose.pose.position.x"])
-        assert found.keys() == {"/cf1/odom", "/cf3/odom"}
-        for topic, columns in found.items():
-            assert list(columns) == ["log_time_ns", "publish_time_ns", "pose.pose.position.x"]
-            assert np.array_equal(columns["pose.pose.position.x"], bag.columns(topic)["pose.pose.position.x"])
 
 
 def test_what_is_no_bag_is_said_in_one_line(tmp_path: Path) -> None:

@@ -250,3 +250,21 @@ def test_cut_anywhere_it_verifies_up_to_its_end(mode, tmp_path, monkeypatch, cap
     (cut / "bag_0.mcap").write_bytes(data[: len(data) // 2])
     assert cli.main(["recover", str(cut)]) == 0
     assert "breaks off at" in capsys.readouterr().out
+    check_holes(whole, cut, complete.slots, pick)
+
+
+def check_holes(whole: Path, directory: Path, slots: int, pick: random.Random) -> None:
+    """Of a bag with a hole in its middle what stands before the hole is right, and what follows is not called wrong."""
+    data, chunks, found = whole.read_bytes(), chunks_of(whole), set()
+    for k in range(10):
+        first = pick.randrange(2, len(chunks) - 3)
+        start, end = chunks[first][0], chunks[pick.randrange(first, min(first + 9, len(chunks) - 2))][1]
+        (directory / "bag_0.mcap").write_bytes(data[:start] + bytes(end - start) + data[end:])
+        result = recover(directory, directory.parent / f"hole{k}")
+        assert not result.closed
+        verified = verify_bag(result.directory)
+        assert verified.ok, (first, verified.difference)
+        assert verified.broken_off
+        assert 0 < verified.slots < slots
+        found.add(verified.slots)
+    assert len(found) > 3

@@ -35,7 +35,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import PROFILES, load_profiles
-from dtsa_bench.log.bag.reader import Bag, Message
+from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.replay import Player, ros_profile
 from dtsa_bench.log.bag.writer import BagWriter
 
@@ -47,12 +47,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
 
 class Listener:
     def __init__(self) -> None:
-        self.messages: list[Message] = []
+        self.messages: list[BagMessage] = []
         self.walls: list[int] = []
         self.clocks: list[int] = []
         self.clock_walls: list[int] = []
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: BagMessage) -> None:
         self.messages.append(message)
         self.walls.append(time.monotonic_ns())
 

@@ -17,7 +17,7 @@ from dtsa_bench.experiments.sweep import make_sweep
 from dtsa_bench.log.losses import HEARD, LOST, UNKNOWN, fit_links, learn, observe
 from dtsa_bench.log.agent_bag import read
 from dtsa_bench.log.merge.merge import Merge
-from dtsa_bench.log.merged_bag import align, write_merged
+from dtsa_bench.log.merged_bag import write_merged
 from dtsa_bench.log.record import load_log
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.runs.config import RunConfig
@@ -159,8 +159,8 @@ def test_agents_over_udp(tmp_path):
     for record in bags[1].slots:
         record.heard[:] = [one for one in record.heard if one.sender != 1 or draw.random() > 0.4]
     together = Merge(bags)
-    result = together.judge()
-    write_merged(tmp_path / "whole", align(together, result), result)
+    result = together.summary()
+    write_merged(tmp_path / "whole", together.log, result)
     found = learn([str(tmp_path / "whole")])
     sent, lost = np.array(found["sent"]), np.array(found["lost"])
     rates = lost / np.maximum(sent, 1)

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from dtsa_bench.commands.cli import main
-from dtsa_bench.log.bag.reader import Bag, Message
+from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.record import SLOT_RECORD, load_log
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.log.verify.result import Result
@@ -42,7 +42,7 @@ FIELDS = (
     "command",
     "goal",
 )
-Edit = Callable[[list[Message]], list[Message]]
+Edit = Callable[[list[BagMessage]], list[BagMessage]]
 
 
 def dtsa(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -141,7 +141,7 @@ def test_a_sealed_flight_verifies_with_its_key_only(sealed: Path, monkeypatch: p
         assert not path.is_file() or KEY[-6:].encode() not in path.read_bytes()  # the key is nowhere
 
 
-def frame_places(messages: list[Message], bag: Bag) -> list[tuple[int, int]]:
+def frame_places(messages: list[BagMessage], bag: Bag) -> list[tuple[int, int]]:
     places = []
     for index, message in enumerate(messages):
         if message.topic == SLOT_RECORD:
@@ -152,14 +152,14 @@ def frame_places(messages: list[Message], bag: Bag) -> list[tuple[int, int]]:
     return places
 
 
-def altered(message: Message, at: int, bit: int) -> Message:
+def altered(message: BagMessage, at: int, bit: int) -> BagMessage:
     data = bytearray(message.data)
     data[at] ^= 1 << bit
     return message._replace(data=bytes(data))
 
 
 def tampering(random: np.random.Generator, kind: str, places: list[tuple[int, int]]) -> Edit:
-    def edit(messages: list[Message]) -> list[Message]:
+    def edit(messages: list[BagMessage]) -> list[BagMessage]:
         if kind == "byte":
             index, at = places[random.integers(len(places))]
             messages[index] = altered(messages[index], at, int(random.integers(8)))
@@ -210,7 +210,7 @@ def test_a_changed_frame_is_named_and_shown_in_words_without_any_digest(flight, 
         index, sent = next((i, m) for i in later if (m := bag.decode(messages[i])).data.size)
     at = messages[index].data.find(sent.data.tobytes()) + 8
 
-    def edit(messages: list[Message]) -> list[Message]:
+    def edit(messages: list[BagMessage]) -> list[BagMessage]:
         messages[index] = altered(messages[index], at, 0)
         return messages
 
@@ -235,15 +235,15 @@ def result_of(flight: Path, tmp_path: Path, edit: Edit) -> Result:
 
 @pytest.mark.parametrize("topic", [SLOT_RECORD, "/swarm/markers", "/cf3/odom"])
 def test_a_missing_message_and_a_wrong_sequence_number_are_found_without_any_digest(flight, tmp_path, topic):
-    def middle(messages: list[Message]) -> int:
+    def middle(messages: list[BagMessage]) -> int:
         of_topic = [i for i, m in enumerate(messages) if m.topic == topic]
         return of_topic[len(of_topic) // 2]
 
-    def drop(messages: list[Message]) -> list[Message]:
+    def drop(messages: list[BagMessage]) -> list[BagMessage]:
         del messages[middle(messages)]
         return messages
 
-    def renumber(messages: list[Message]) -> list[Message]:
+    def renumber(messages: list[BagMessage]) -> list[BagMessage]:
         at = middle(messages)
         messages[at] = messages[at]._replace(sequence=messages[at].sequence + 1)
         return messages
@@ -256,7 +256,7 @@ def test_a_missing_message_and_a_wrong_sequence_number_are_found_without_any_dig
 
 
 def test_an_account_that_is_missing_is_named(flight: Path, tmp_path: Path) -> None:
-    def without_ids(messages: list[Message]) -> list[Message]:
+    def without_ids(messages: list[BagMessage]) -> list[BagMessage]:
         records = [i for i, m in enumerate(messages) if m.topic == SLOT_RECORD]
         at = records[len(records) // 2]
         with Bag(flight / "bag") as bag:
@@ -275,7 +275,7 @@ def test_an_account_that_is_missing_is_named(flight: Path, tmp_path: Path) -> No
 def test_a_changed_field_is_named_with_slot_and_agent(flight: Path, tmp_path: Path, name: str) -> None:
     changed = []
 
-    def edit(messages: list[Message]) -> list[Message]:
+    def edit(messages: list[BagMessage]) -> list[BagMessage]:
         with Bag(flight / "bag") as bag:
             for i in range(len(messages) // 2, len(messages)):
                 if messages[i].topic != SLOT_RECORD:

@@ -16,7 +16,7 @@ from waiting import wait_for
 pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_agent.core.frame import decode_extended
-from dtsa_bench.log.bag.reader import Bag, Message
+from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.record import SLOT_RECORD, TYPE
 from dtsa_bench.log.verify.check import verify_bag
@@ -62,7 +62,7 @@ def rewritten(original: Path, copy: Path, edit: Edit, **config: Any) -> Result:
     return verify_bag(copy)
 
 
-def untouched(message: Message, value: Any, pack: Callable[[Any], bytes]) -> bytes:
+def untouched(message: BagMessage, value: Any, pack: Callable[[Any], bytes]) -> bytes:
     return message.data
 
 
@@ -70,7 +70,7 @@ def once(change: Callable[[Any], bool]) -> Callable[..., bytes | None]:
     """An edit of one record: the first from slot `BEGUN` on that ``change`` says it has changed."""
     done: list[bool] = []
 
-    def edit(message: Message, value: Any, pack: Callable[[Any], bytes]) -> bytes | None:
+    def edit(message: BagMessage, value: Any, pack: Callable[[Any], bytes]) -> bytes | None:
         if done or value.slot < BEGUN:
             return message.data
         for name, field in vars(value).items():
@@ -148,7 +148,7 @@ def test_a_changed_record_is_named(flown: Path, tmp_path: Path, change: Any, wha
 def test_a_missing_record_is_found_without_the_digest(flown: Path, tmp_path: Path) -> None:
     dropped = []
 
-    def edit(message: Message, value: Any, pack: Callable[[Any], bytes]) -> bytes | None:
+    def edit(message: BagMessage, value: Any, pack: Callable[[Any], bytes]) -> bytes | None:
         if dropped or value.slot < BEGUN:
             return message.data
         return dropped.append(message)

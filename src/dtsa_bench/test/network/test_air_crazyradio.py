@@ -145,7 +145,7 @@ def test_a_dongle_that_goes_and_is_back_is_said_and_flies_on(tmp_path: Path) -> 
             stack.close()
     assert {one.agent.summary()["times_unplugged"] for one in flying} == {1}
     assert "crazyradio" not in {thread.name for thread in threading.enumerate()}
-    merged = Merge([read(tmp_path / f"cf{agent}.mcap") for agent in (1, 2)]).judge()
+    merged = Merge([read(tmp_path / f"cf{agent}.mcap") for agent in (1, 2)]).summary()
     assert merged["decisions_again"]["differences"] == []
 
 

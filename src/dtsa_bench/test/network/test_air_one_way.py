@@ -17,9 +17,9 @@ from dtsa_agent.air.settings import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import AgentBag, NothingWritten, read
-from dtsa_bench.log.merge.joined import all_known_after
-from dtsa_bench.log.merge.merge import Merge, count_unmatched_frames
-from dtsa_bench.log.merge.timeline import Crossing, Life, both_ways, fit
+from dtsa_bench.log.merge.merge import Merge
+from dtsa_bench.log.merge.timeline import Crossing, Process, both_ways, fit
+from dtsa_bench.log.merged_flight import count_unmatched_frames, slots_until_all_known
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
 
@@ -107,8 +107,8 @@ def test_frames_of_a_process_that_wrote_nothing_are_no_lies(bags, tmp_path, caps
     later = read(bags[1])
     middle = later.slots[len(later.slots) // 2].slot
     later.slots = [record for record in later.slots if record.slot >= middle]
-    assert Merge([read(bags[0]), later]).judge()["frames_heard_not_as_sent"] > 0
-    assert Merge([read(bags[0]), later], ["runs/cf2"]).judge()["frames_heard_not_as_sent"] == 0
+    assert Merge([read(bags[0]), later]).summary()["frames_heard_not_as_sent"] > 0
+    assert Merge([read(bags[0]), later], ["runs/cf2"]).summary()["frames_heard_not_as_sent"] == 0
 
 
 def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: list[Path]) -> None:
@@ -116,22 +116,23 @@ def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: 
     later = read(bags[1])
     middle = later.slots[len(later.slots) // 2].slot
     later.slots = [record for record in later.slots if record.slot >= middle]
-    merge = Merge([read(bags[0]), later])
-    assert count_unmatched_frames(merge.lives, merge.sent, True) > 0
-    assert count_unmatched_frames(merge.lives, merge.sent, True, [2]) == 0
-    assert count_unmatched_frames(merge.lives, merge.sent, True, [1]) > 0
+    log = Merge([read(bags[0]), later]).log
+    assert count_unmatched_frames(log) > 0
+    for agents, is_right in (([2], True), ([1], False)):
+        log.merged["agents_that_gave_up_a_time"] = agents
+        assert (count_unmatched_frames(log) == 0) == is_right
 
 
 def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:
     ones = [read(path) for path in bags[:2]]
-    before = Merge(ones).judge()["flight"]
+    before = Merge(ones).summary()["flight"]
     first, last = ones[1].slots[0].slot, ones[1].slots[-1].slot
     since = first + (last - first) // 2
-    assert last - since > 2 * all_known_after(CONFIG)
+    assert last - since > 2 * slots_until_all_known(CONFIG)
     for record in ones[1].slots:  # cf2 heard nothing in the second half
         if record.slot >= since:
             record.heard = []
-    after = Merge(ones).judge()["flight"]
+    after = Merge(ones).summary()["flight"]
     assert before["heard_age_max_slots"] < after["heard_age_max_slots"] <= last - since + before["heard_age_max_slots"]
     assert after["heard_age_max_slots"] > (last - since) * 0.8
     assert after["heard_age_max_pair"] == [2, 1]
@@ -150,7 +151,7 @@ def _crossings(delays_ns: dict[tuple[int, int], int], frames: int = 400) -> list
     ]
 
 
-def _names(groups: list[tuple[Life, ...]]) -> list[tuple[int, ...]]:
+def _names(groups: list[tuple[Process, ...]]) -> list[tuple[int, ...]]:
     return [tuple(agent for agent, _ in group) for group in groups]
 
 
@@ -190,7 +191,7 @@ def test_slots_of_times_that_were_given_up_are_kept_apart() -> None:
         ]
         return AgentBag(Path("cf1.mcap"), 1, CONFIG, NETWORK, 0, records)
 
-    lives = Merge([process([70, 71, 3, 4]), process([90, 91, 80, 5, 6])]).lives
-    assert {life: [record.slot for record in bag.slots] for life, bag in lives.items()} == {
+    processes = Merge([process([70, 71, 3, 4]), process([90, 91, 80, 5, 6])]).processes
+    assert {process: [record.slot for record in bag.slots] for process, bag in processes.items()} == {
         (1, 0): [3, 4], (1, 1): [5, 6], (1, -1): [70, 71], (1, -2): [80], (1, -3): [90, 91],
     }  # fmt: skip

@@ -12,7 +12,7 @@ from waiting import wait_for
 from dtsa_agent.air.settings import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.log.agent_bag import read
-from dtsa_bench.log.merge.merge import Merge, verified
+from dtsa_bench.log.merge.merge import Merge, is_verified
 
 CONFIG = SwarmConfig(agents=4, policy="tdma", slot_ms=20.0)  # a frame counts for 40 slots
 FAST, SLOW = 0.05, 0.001  # m/s
@@ -57,10 +57,10 @@ def test_an_agent_whose_frames_are_lost_one_way_hovers_in_flight_and_flies_on_wh
     assert summary["held_slots"] > 20
     assert summary["quorum"] == "all-but-one"
     assert [agent.agent.summary()["held_slots"] for agent in others] == [0, 0, 0]
-    found = Merge([read(tmp_path / f"cf{agent}.mcap") for agent in range(1, 5)]).judge()
+    found = Merge([read(tmp_path / f"cf{agent}.mcap") for agent in range(1, 5)]).summary()
     assert found["held_slots"].keys() == {"cf4"}
     assert found["never_flew"] == []
-    assert verified(found), found["decisions_again"]
+    assert is_verified(found), found["decisions_again"]
 
 
 def test_an_agent_that_nobody_has_heard_does_not_begin_to_fly(groups: tuple[str, str], tmp_path: Path) -> None:

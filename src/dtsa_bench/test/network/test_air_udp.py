@@ -29,9 +29,9 @@ from dtsa_bench.log.agent_bag import read
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BagWriter
-from dtsa_bench.log.merge.merge import Merge, verified
+from dtsa_bench.log.merge.merge import Merge, is_verified
 from dtsa_bench.log.merge.timeline import Crossing, fit
-from dtsa_bench.log.merged_bag import align, write_merged
+from dtsa_bench.log.merged_bag import write_merged
 from dtsa_bench.log.record import SLOT_RECORD, load_log
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
@@ -164,15 +164,15 @@ def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespa
     bags = [read(path) for path in flight.bags]
     said = bags[0].slots[-20]
     said.chosen = 4 if said.chosen != 4 else 1
-    found = Merge(bags).judge()
-    assert not verified(found)
+    found = Merge(bags).summary()
+    assert not is_verified(found)
     assert [(one["agent"], one["slot"], one["field"]) for one in found["decisions_again"]["differences"]] == [
         (1, said.slot, "chosen")
     ]
     bags = [read(path) for path in flight.bags]
     spoken = next(record for record in bags[1].slots[-60:] if record.datagram)
     spoken.datagram = spoken.datagram[:-5] + bytes([spoken.datagram[-5] ^ 1]) + spoken.datagram[-4:]
-    assert Merge(bags).judge()["frames_heard_not_as_sent"] > 0
+    assert Merge(bags).summary()["frames_heard_not_as_sent"] > 0
     for number, name in enumerate(("chosen", "digest", "lost", "received", "data", "odom")):
         with Bag(flight.whole) as bag, BagWriter(tmp_path / f"{number}", None, custom_data=bag.custom_data) as copy:
             channels = {name: copy.add_topic(name, info.type, info.profiles) for name, info in bag.topics.items()}
@@ -191,15 +191,13 @@ def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespa
                 copy.write(channels[message.topic], data, message.log_time_ns, message.publish_time_ns)
         assert changed
         assert verify_bag(tmp_path / f"{number}").difference is not None, name
-    liar = flight.run.lives[(2, 0)].slots[-20]
-    said, liar.chosen = liar.chosen, 4 if liar.chosen != 4 else 1
-    try:
-        write_merged(tmp_path / "lie", flight.run, {})
-    finally:
-        liar.chosen = said
+    log = Merge([read(path) for path in flight.bags]).log
+    row = int(np.flatnonzero(log.known[:, 1])[-20])
+    log.chosen[row, 1] = 4 if log.chosen[row, 1] != 4 else 1
+    write_merged(tmp_path / "lie", log, {})
     difference = verify_bag(tmp_path / "lie").difference
     assert difference is not None
-    assert (difference.what, difference.slot, difference.agent) == ("chosen", liar.slot, 2)
+    assert (difference.what, difference.slot, difference.agent) == ("chosen", log.first_slot + row, 2)
 
 
 def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Path) -> None:
@@ -209,18 +207,18 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Pa
     bag = read(cut)
     assert bag.broken_off
     assert 0 < len(bag.slots) < len(read(flight.bags[0]).slots)
-    found = Merge([bag, *(read(path) for path in flight.bags[1:])]).judge()
+    found = Merge([bag, *(read(path) for path in flight.bags[1:])]).summary()
     assert found["broken_off"] == ["cf1"]
-    assert verified(found)
+    assert is_verified(found)
     saved = read(recover(cut).directory)
     assert [record.slot for record in saved.slots] == [record.slot for record in bag.slots]
-    again = Merge([saved, *(read(path) for path in flight.bags[1:])]).judge()
+    again = Merge([saved, *(read(path) for path in flight.bags[1:])]).summary()
     assert {**again, "broken_off": []} == {**found, "broken_off": []}, again
     assert again["broken_off"] == ["cf1"]
     for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
         cut.write_bytes(bad)
         with pytest.raises(DtsaError):
-            Merge([read(cut)]).judge()
+            Merge([read(cut)]).summary()
 
 
 def test_a_merged_flight_is_kept_as_a_bag_in_which_nothing_is_known_of_who_has_none(flight: SimpleNamespace) -> None:
@@ -303,19 +301,19 @@ def test_commands_join_the_bags_of_agents_by_themselves(flight, which, tmp_path,
 def test_bags_that_do_not_belong_together_are_refused(flight: SimpleNamespace) -> None:
     one = read(flight.bags[0])
     with pytest.raises(ConfigError, match="one process of cf1 at a time"):
-        Merge([one, read(flight.bags[0])]).judge()
+        Merge([one, read(flight.bags[0])]).summary()
     other = read(flight.bags[1])
     other.swarm = dataclasses.replace(CONFIG, auth_session=8)
     with pytest.raises(ConfigError, match="auth_session 8, there 7"):
-        Merge([one, other]).judge()
+        Merge([one, other]).summary()
     with pytest.raises(ConfigError, match="bags"):
-        Merge([]).judge()
+        Merge([]).summary()
     deaf = read(flight.bags[1])
     for record in (*one.slots, *deaf.slots):
         record.before, record.heard = [], []
     apart = Merge([one, deaf])
     with pytest.raises(ConfigError, match=r"hear each other|do not go both ways"):
-        align(apart, apart.judge())
+        _ = apart.log
 
 
 def test_offsets_and_drifts_are_found_among_frames_that_were_held_up() -> None:

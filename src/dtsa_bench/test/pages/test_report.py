@@ -25,9 +25,8 @@ from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.record import SLOT_RECORD, load_log
 from dtsa_bench.log.verify.check import verify_bag
-from dtsa_bench.pages.report.data import run_data
+from dtsa_bench.pages.report.data import render, run_data, write_report
 from dtsa_bench.pages.report.distances import pair_distances
-from dtsa_bench.pages.report.page import render, write_report
 from dtsa_bench.pages.report.tables import Part, write_tables
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import simulate

@@ -9,7 +9,7 @@ import pytest
 
 from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins.guard import Guarded
-from dtsa_bench.simulation.unslotted import Radios
+from dtsa_bench.simulation.unslotted import ListeningRadios
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 from dtsa_channel_sim.model.air import NEVER
 
@@ -32,8 +32,8 @@ class Waits:
         return 100_000 if busy else 0
 
 
-def radios(air: Air[Any], rule: type = Waits) -> Radios:
-    return Radios(air, [Guarded("policy", "waits", rule, None, agent) for agent in (1, 2, 3)])
+def radios(air: Air[Any], rule: type = Waits) -> ListeningRadios:
+    return ListeningRadios(air, [Guarded("policy", "waits", rule, None, agent) for agent in (1, 2, 3)])
 
 
 def sends(range_m: float, *at_ns: int) -> tuple[list[int], dict[int, int]]:

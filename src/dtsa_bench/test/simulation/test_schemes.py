@@ -24,7 +24,7 @@ from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.flights.flight import FlightOptions, check_options
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.schemes.knowledge import whittle_index
-from dtsa_bench.simulation.schemes.mixer import Decoder
+from dtsa_bench.simulation.schemes.mixer import FrameSolver
 from dtsa_bench.simulation.schemes.sotdma import Sotdma
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_bench.simulation.unslotted import UnslottedTraffic
@@ -132,7 +132,7 @@ def test_a_round_of_mixer_brings_all_states_to_all_also_where_frames_are_lost() 
 
 def test_what_mixer_combines_is_solved_for_as_soon_as_there_are_enough() -> None:
     draw, frames = np.random.default_rng(1), {k: int(v) for k, v in enumerate(range(100, 110), 1)}
-    heard, count = Decoder(), 0
+    heard, count = FrameSolver(), 0
     while len(heard.rows) < len(frames):
         vector = int(draw.integers(1, 1 << len(frames)))
         mixed = 0

@@ -15,7 +15,7 @@ from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import may_share
-from dtsa_bench.simulation.simulate import Flight, simulate
+from dtsa_bench.simulation.simulate import SimulatedFlight, simulate
 from dtsa_channel_sim import Channel
 
 
@@ -23,11 +23,11 @@ def run(**settings: Any) -> RunConfig:
     return run_config({"seed": 7, "timeout_s": 4.0, **settings})
 
 
-def fly(**settings: Any) -> Flight:
+def fly(**settings: Any) -> SimulatedFlight:
     return simulate(run(**settings), log=True, observer=1)
 
 
-def plain(flight: Flight) -> dict[str, Any]:
+def plain(flight: SimulatedFlight) -> dict[str, Any]:
     return {key: value for key, value in flight.summary().items() if key not in ("wall_time_s", "realtime_factor")}
 
 

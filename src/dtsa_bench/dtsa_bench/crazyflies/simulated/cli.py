@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.priority import set_realtime
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
 from dtsa_bench.crazyflies.simulated.radio.side import Dongles
-from dtsa_bench.runs.options import add_options, given, whole_number
+from dtsa_bench.runs.options import add_options, given_options, whole_number
 
 from .fleet import NUMBERS, Fleet
 from .fleet_config import LAYOUTS, FleetConfig, start_positions
@@ -72,8 +72,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def fleet_config(args: argparse.Namespace) -> FleetConfig:
     """Configuration from the command line."""
-    radio = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
-    options = {**given(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
+    radio = RadioSettings(**given_options(args, RadioSettings, "radio"), path=args.simulated_radio)
+    options = {**given_options(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
     if args.config is not None:
         return _from_swarm(args.config, options)
     if radio.path is not None:
@@ -119,7 +119,7 @@ def request_fault(args: argparse.Namespace) -> None:
         except ValueError:
             raise ConfigError("cf", args.cf, "an id, or all") from None
     numbers = {name: getattr(args, name) for name in NUMBERS if getattr(args, name) is not None}
-    port = FleetConfig(**given(args, FleetConfig, "fleet")).control_port
+    port = FleetConfig(**given_options(args, FleetConfig, "fleet")).control_port
     send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **numbers)
     print(f"{args.fault}: cf {args.cf}")
 
@@ -175,7 +175,7 @@ def _run_dongles(args: argparse.Namespace, priority: int) -> int:
     """Simulated Crazyradios alone, until Ctrl-C; exit code."""
     if args.simulated_radio is None or args.config is not None:
         raise ConfigError("dongles_only", True, "with --simulated-radio SOCKET, and without --config")
-    settings = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
+    settings = RadioSettings(**given_options(args, RadioSettings, "radio"), path=args.simulated_radio)
     dongles = Dongles(settings)
     set_realtime(priority)
     _end_by_signals(dongles.stop, args.ignore_interrupt)

@@ -17,9 +17,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import breakup_chunk
@@ -30,19 +30,21 @@ from rosbags.typesys.store import Typestore
 
 from dtsa_bench.runs.program import program
 
-from . import columns, metadata
+from . import metadata
 from .errors import BagError, UnusableBag
 from .schema import Definition
 
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
+_DATA_END = struct.Struct("<BQI")  # opcode, length, checksum of all that stands before it; 0: none
 _END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
 _ROS = "cdr/ros2msg"
 _MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
+NOT_OF_ITS_TYPE = (SerdeError, AssertionError, IndexError, KeyError, ValueError, struct.error)  # of rosbags
 _ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
 
-class Message(NamedTuple):
+class BagMessage(NamedTuple):
     """One recorded message."""
 
     topic: str
@@ -75,7 +77,7 @@ class Bag:
 
     def __init__(self, path: str | Path) -> None:
         self.given = Path(path)
-        paths = metadata.find_files(self.given)
+        paths = self._paths = metadata.find_files(self.given)
         self.path = paths[0]
         with ExitStack() as stack:
             self._open([(part, stack.enter_context(metadata.open_file(part))) for part in paths])
@@ -114,6 +116,7 @@ class Bag:
         self.end_ns: int = max(part.message_end_time for part in statistics)
         records = self._records()
         self._has_packed_messages = any(map(metadata.has_packed_messages, records))
+        self.typestore = get_typestore(Stores.EMPTY)  # of the types that were decoded
         #: The recorder's own texts; empty in a foreign bag.
         self.custom_data = next(filter(None, map(metadata.custom_data, records)), {})
 
@@ -182,7 +185,7 @@ class Bag:
 
     def messages(
         self, topics: Collection[str] | None = None, start_ns: int = 0, end_ns: int = (1 << 63) - 1
-    ) -> Iterator[Message]:
+    ) -> Iterator[BagMessage]:
         """Messages in order of log time, those of equal time as recorded; about two chunks of a file are in memory.
 
         :param topics: names; None: all.
@@ -198,12 +201,12 @@ class Bag:
 
     def _messages(
         self, reader: SeekingReader, wanted: set[str] | None, start_ns: int, end_ns: int
-    ) -> Iterator[Message]:
+    ) -> Iterator[BagMessage]:
         unpack = metadata.unpack_message if self._has_packed_messages else bytes
         try:
             for schema, channel, message in reader.iter_messages(wanted, starting_at=start_ns, ending_at=end_ns):
                 kind, data = schema.name if schema else "", unpack(message.data)
-                yield Message(channel.topic, kind, message.log_time, message.publish_time, message.sequence, data)
+                yield BagMessage(channel.topic, kind, message.log_time, message.publish_time, message.sequence, data)
         except Exception as error:  # the libraries meet damage with many kinds of errors
             raise self._damaged(f"damaged chunk: {error or type(error).__name__}") from None
 
@@ -218,81 +221,39 @@ class Bag:
             )
         return self.topics[name]
 
-    @cached_property
-    def typestore(self) -> Typestore:
-        """Decoder of the message types in this bag, made from those definitions in it that can be used."""
-        store = get_typestore(Stores.EMPTY)
-        self._unusable: dict[str, str] = {}  # why a type cannot be decoded
-        for topic in self.topics.values():
-            if topic.encoding != _ROS:
-                self._unusable[topic.type] = f"it is recorded as {topic.encoding}, not as {_ROS}"
-            elif topic.type not in store.fielddefs:
-                try:
-                    types = get_types_from_msg(topic.definition, topic.type)
-                    store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
-                    if topic.type not in store.fielddefs:
-                        raise ValueError("it is not of the form package/msg/Type")
-                except Exception as error:  # the parser meets texts from outside with many kinds of errors
-                    self._unusable[topic.type] = f"its definition cannot be used: {error}".partition("\n")[0]
-        return store
-
-    def _decodable(self, topic: str) -> Topic:
-        """A topic whose messages can be decoded.
-
-        :raises UnusableBag: if they cannot.
-        """
-        found = self.topic(topic)
-        if found.type not in self.typestore.fielddefs:
-            raise UnusableBag(self.given, f"topic {topic}, {found.type}: {self._unusable[found.type]}")
-        return found
-
-    def decode(self, message: Message) -> Any:
+    def decode(self, message: BagMessage) -> Any:
         """The message as an object with its fields as attributes; arrays of numbers are NumPy arrays.
 
         :raises UnusableBag: if its definition cannot be used.
         :raises BagError: if the bytes do not fit the type.
         """
+        if message.type not in self.typestore.fielddefs:
+            topic = self.topic(message.topic)
+            try:
+                if topic.encoding != _ROS:
+                    raise ValueError(f"it is recorded as {topic.encoding}, not as {_ROS}")
+                register_type(self.typestore, topic.type, topic.definition)
+            except ValueError as error:
+                raise UnusableBag(self.given, f"topic {topic.name}, {topic.type}: {error}") from None
         try:
             return self.typestore.deserialize_cdr(message.data, message.type)
-        except (SerdeError, AssertionError, IndexError, KeyError) as error:
-            self._decodable(message.topic)
-            raise BagError(
-                f"{message.topic} at {message.log_time_ns} ns: not a valid {message.type} ({error})"
-            ) from None
+        except NOT_OF_ITS_TYPE as error:
+            what = f"{message.topic} at {message.log_time_ns} ns"
+            raise BagError(f"{what}: not a valid {message.type} ({error})") from None
 
-    def typed(self, topics: Collection[str] | None = None) -> Iterator[tuple[Message, Any]]:
+    def typed(self, topics: Collection[str] | None = None) -> Iterator[tuple[BagMessage, Any]]:
         """Messages in order of log time, each with what it decodes to."""
         for message in self.messages(topics):
             yield message, self.decode(message)
 
-    def columns(self, topic: str, fields: Collection[str] | None = None) -> dict[str, np.ndarray]:
-        """All messages of one topic as arrays with one row a message.
+    def check_files(self) -> None:
+        """Whether the files are as they were finished, by their checksums; it takes a pass over them.
 
-        `log_time_ns` and `publish_time_ns` come first, then the fields by their dotted names. A number is
-        (M,), an array that has the same length in all messages (M, k), an array of changing length an
-        object array of arrays, a string an object array of str. Lists of nested messages are left out.
-
-        :param topic: name of the topic.
-        :param fields: names of fields to keep; None: all.
-        :raises BagError: if a message does not fit its type.
+        :raises UnusableBag: if one is not.
         """
-        return self.tables([topic], fields)[topic]
-
-    def tables(
-        self, topics: Collection[str] | None = None, fields: Collection[str] | None = None
-    ) -> dict[str, dict[str, np.ndarray]]:
-        """Columns of several topics, in one pass over the file.
-
-        :param topics: names; None: all.
-        :param fields: names of fields to keep, of whatever topic; None: all.
-        """
-        found = {
-            name: columns.Table(self.typestore, self._decodable(name).type, fields)
-            for name in (self.topics if topics is None else topics)
-        }
-        for message in self.messages(list(found)):
-            found[message.topic].add(message.log_time_ns, message.publish_time_ns, message.data)
-        return {name: table.finish() for name, table in found.items()}
+        for path in self._paths:
+            if fault := checksum_fault(path):
+                raise self._damaged(f"{path.name}: {fault}")
 
     def close(self) -> None:
         """Close the files."""
@@ -303,6 +264,40 @@ class Bag:
 
     def __exit__(self, *unused: object) -> None:
         self.close()
+
+
+def register_type(store: Typestore, kind: str, definition: str) -> None:
+    """Make a type of messages known, by the definition of it and of all that it needs.
+
+    :raises ValueError: if the definition cannot be used.
+    """
+    try:
+        types = get_types_from_msg(definition, kind)
+        store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
+        if kind not in store.fielddefs:
+            raise ValueError("it is not of the form package/msg/Type")
+    except Exception as error:  # the parser meets texts from outside with many kinds of errors
+        raise ValueError(f"its definition cannot be used: {error}".partition("\n")[0]) from None
+
+
+def checksum_fault(path: Path) -> str:
+    """What the checksums of a finished file say against it; empty: nothing. A change of any of its bytes shows."""
+    try:
+        with metadata.open_file(path) as stream:
+            read_index(stream)
+            stream.seek(-_END.size, 2)
+            start, _, _, mark = _END.unpack(stream.read())
+            stream.seek(start - _DATA_END.size)
+            opcode, length, checksum = _DATA_END.unpack(stream.read(_DATA_END.size))
+            if mark != MAGIC or opcode != Opcode.DATA_END or length != _DATA_END.size - PREFIX.size:
+                return "the end of its messages is damaged"
+            stream.seek(0)
+            left, found = start - _DATA_END.size, 0
+            while left and (block := stream.read(min(left, 1 << 20))):
+                left, found = left - len(block), zlib.crc32(block, found)
+    except Exception as error:  # the library meets damaged files with many kinds of errors
+        return f"its index is damaged ({error or type(error).__name__})"
+    return "" if checksum in (0, found) else "its contents do not fit their checksum"
 
 
 def read_index(stream: IO[bytes]) -> tuple[SeekingReader, Summary | None]:

@@ -74,7 +74,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
     beside = bag.with_name(f"{bag.name if bag.is_dir() else bag.name.partition('.mcap')[0]}_recovered")
     result = Recovery(paths[0], beside if directory is None else Path(directory))
     with ExitStack() as stack:
-        files = [_DamagedFile(part, path, stack) for part in paths]
+        files = [RecordScan(part, path, stack) for part in paths]
         profile, about = _begin(files, path)
         custom_data = {**metadata.custom_data(about), metadata.RECOVERED_FROM: result.source.name}
         with BagWriter(result.directory, None, custom_data=custom_data, min_time_ns=0, profile=profile) as writer:
@@ -98,7 +98,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
     return result
 
 
-def _begin(files: list[_DamagedFile], given: str | Path) -> tuple[str, dict[str, Any]]:
+def _begin(files: list[RecordScan], given: str | Path) -> tuple[str, dict[str, Any]]:
     """MCAP's profile, and what the recorder says of the bag before its first message.
 
     :raises UnusableBag: if there is no message that can be read.
@@ -118,8 +118,8 @@ def _begin(files: list[_DamagedFile], given: str | Path) -> tuple[str, dict[str,
     raise UnusableBag(given, "no message in it can be read: there is nothing to save")
 
 
-class _DamagedFile:
-    """One file of a bag, readable or not; open as long as the stack."""
+class RecordScan:
+    """The records of one file of a bag, finished and whole or not; open as long as the stack."""
 
     def __init__(self, path: Path, given: str | Path, stack: ExitStack) -> None:
         self.path = path
@@ -128,11 +128,14 @@ class _DamagedFile:
         self.summary = Summary()  # as the file's own index has it; empty if there is none
         self.counts: dict[int, int] = {}  # messages by channel, likewise
         self.about: dict[str, Any] = {}  # what the recorder says of the bag, likewise
+        self.is_finished = False  # whether reading has come to the end of the messages
+        self.is_closed = False  # whether the file has an end
         self._tried = 0  # bytes of what looked like chunks
         stream = stack.enter_context(metadata.open_file(path))
         if stream.read(len(MAGIC)) != MAGIC:
             raise UnusableBag(given, f"{path.name} is not an MCAP file, or its beginning is lost")
         self._data = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+        self.is_closed = self._data[-len(MAGIC) :] == MAGIC and len(self._data) > len(MAGIC)
         with suppress(Exception):  # of a damaged file: whatever the library meets, there is no index then
             reader, summary = read_index(stream)
             self.summary = summary or self.summary
@@ -153,6 +156,7 @@ class _DamagedFile:
                 if length > size - begin:
                     raise ValueError("it is cut off")
                 if opcode == Opcode.DATA_END and length == 4:
+                    self.is_finished = True
                     return
                 if opcode == Opcode.MESSAGE and chunked:  # it has no checksum: as likely a damaged index
                     raise ValueError("a message outside of chunks")
@@ -208,7 +212,7 @@ class _Copy:
         self.lost: Counter[str] = Counter()  # by why it is lost
         self.expected: Counter[str] = Counter()  # messages by topic, as the files' own indexes say
 
-    def add(self, file: _DamagedFile) -> None:
+    def add(self, file: RecordScan) -> None:
         """Copy what can be read of one file."""
         schemas, channels = dict(file.summary.schemas), dict(file.summary.channels)
         targets: dict[int, int] = {}  # channels of the new bag by those of the file; 0: none

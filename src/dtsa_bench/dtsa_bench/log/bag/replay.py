@@ -16,7 +16,7 @@ from dtsa_agent.ros.common.cdr import SECOND
 from . import schema
 from .errors import BagError
 from .metadata import PROFILES, Profile
-from .reader import Bag, Message, Topic
+from .reader import Bag, BagMessage, Topic
 
 CLOCK = "/clock"
 CLOCK_NS = 10_000_000  # ns of wall time, longest time without a /clock message
@@ -155,7 +155,7 @@ class RosOutput:
         """Subscriptions to the recorded topics that have been found so far."""
         return sum(publisher.get_subscription_count() for publisher in self._publishers.values())
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: BagMessage) -> None:
         """Publish the recorded bytes as they are."""
         self._publishers[message.topic].publish(message.data)
 

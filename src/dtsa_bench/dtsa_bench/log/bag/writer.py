@@ -56,7 +56,8 @@ class _Channel:
 class BagWriter:
     """One bag directory being recorded. For one thread; a context manager.
 
-    :param directory: where the bag is made; must not exist, or be empty. Parents are made.
+    :param directory: where the bag is made; must not exist, or be empty. Parents are made. Or the name of an .mcap file,
+        for a bag that is this file alone.
     :param config: configuration of the run, JSON types only: stored whole in the bag, its `seed` once more
         by itself; None: the bag says nothing of its origin but `custom_data`.
     :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
@@ -83,21 +84,20 @@ class BagWriter:
         if compression not in COMPRESSIONS:
             raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
         self.directory = Path(directory)
-        if self.directory.exists() and (not self.directory.is_dir() or any(self.directory.iterdir())):
+        self._is_file = self.directory.suffix == ".mcap"
+        if not self._is_file and self.directory.exists() and (not self.directory.is_dir() or any(self.directory.iterdir())):
             raise ConfigError("directory of the bag", str(directory), "one that is empty or does not exist yet")
         self.custom_data = dict(custom_data or {})
         if config is not None:
             self.custom_data |= {
-                "project": "dtsa",
-                "version": __version__,
+                "project": "dtsa", "version": __version__, "configuration": json.dumps(config, sort_keys=True),
                 "seed": str({**config, **config.get("swarm", {})}.get("seed", "")),
-                "configuration": json.dumps(config, sort_keys=True),
-            }
+            }  # fmt: skip
         if marked:
             self.custom_data["chunks"] = "complete steps"
         self._marked, self._chunk_size, self._min_time_ns = marked, chunk_size, min_time_ns
         self._chunk_bytes = 0  # in the chunk that is being filled
-        self.path = self.directory / f"{self.directory.resolve().name}_0.mcap"
+        self.path = self.directory if self._is_file else self.directory / f"{self.directory.resolve().name}_0.mcap"
         self._channels: list[_Channel] = []  # the channel's number - 1 is its index
         self._schemas: dict[Definition, int] = {}
         self._digest = BagDigest()
@@ -106,12 +106,13 @@ class BagWriter:
         self._failure = ""
         self._closed = False
         try:
-            self.directory.mkdir(parents=True, exist_ok=True)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = self.path.open("xb")
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         size = _UNLIMITED if marked else chunk_size
-        self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
+        kind = COMPRESSIONS[compression]
+        self._mcap = Writer(self._stream, chunk_size=size, compression=kind, enable_data_crcs=True)
         with self._failing():
             self._mcap.start(profile=profile, library=f"dtsa {__version__}")
             self._add_own_metadata()
@@ -195,10 +196,7 @@ class BagWriter:
             self._fail(error)
         self._digest.add(target.key, log_time_ns, publish_time_ns, sequence, data, target.has_run)
         target.count += 1
-        if log_time_ns < self._start_ns:
-            self._start_ns = log_time_ns
-        if log_time_ns > self._end_ns:
-            self._end_ns = log_time_ns
+        self._start_ns, self._end_ns = min(self._start_ns, log_time_ns), max(self._end_ns, log_time_ns)
         if self._marked:
             self._chunk_bytes += len(data) + _RECORD_BYTES
         elif monotonic() >= self._next_flush:
@@ -250,7 +248,8 @@ class BagWriter:
             self._add_own_metadata()
             self._mcap.finish()
             self._stream.close()
-            metadata.write(self.directory, self._metadata())
+            if not self._is_file:
+                metadata.write(self.directory, self._metadata())
 
     def __enter__(self) -> BagWriter:
         return self
@@ -262,44 +261,32 @@ class BagWriter:
         """What `metadata.yaml` says below its root."""
         start_ns, end_ns = self.time_range_ns
         extent = {
-            "starting_time": {"nanoseconds_since_epoch": start_ns},
-            "duration": {"nanoseconds": end_ns - start_ns},
+            "starting_time": {"nanoseconds_since_epoch": start_ns}, "duration": {"nanoseconds": end_ns - start_ns},
             "message_count": self.message_count,
-        }
+        }  # fmt: skip
         topics = [
             {
                 "topic_metadata": {
-                    "name": channel.topic,
-                    "type": channel.definition.name,
+                    "name": channel.topic, "type": channel.definition.name,
                     "serialization_format": channel.definition.message_encoding,
-                    "offered_qos_profiles": channel.profiles,
-                    "type_description_hash": channel.definition.type_hash,
+                    "offered_qos_profiles": channel.profiles, "type_description_hash": channel.definition.type_hash,
                 },
                 "message_count": channel.count,
             }
             for channel in self._channels
-        ]
+        ]  # fmt: skip
         return {
-            "version": metadata.VERSION,
-            "storage_identifier": "mcap",
-            **extent,
-            "topics_with_message_count": topics,
-            "compression_format": "",
-            "compression_mode": "",
-            "relative_file_paths": [self.path.name],
-            "files": [{"path": self.path.name, **extent}],
-            "custom_data": self.custom_data,
-            "ros_distro": "jazzy",
-        }
+            "version": metadata.VERSION, "storage_identifier": "mcap", **extent, "topics_with_message_count": topics,
+            "compression_format": "", "compression_mode": "", "relative_file_paths": [self.path.name],
+            "files": [{"path": self.path.name, **extent}], "custom_data": self.custom_data, "ros_distro": "jazzy",
+        }  # fmt: skip
 
     def _add_own_metadata(self) -> None:
         self._mcap.add_metadata(metadata.RECORD_NAME, {metadata.RECORD_KEY: metadata.dump(self._metadata())})
 
     def _check_open(self) -> None:
-        if self._failure:
-            raise BagError(self._failure)
-        if self._closed:
-            raise BagError(f"the bag {self.directory} is closed: nothing more can be recorded to it")
+        if self._failure or self._closed:
+            raise BagError(self._failure or f"the bag {self.directory} is closed: nothing more can be recorded to it")
 
     @contextmanager
     def _failing(self) -> Iterator[None]:

@@ -1,1 +1,1 @@
-"""The bags of agents on a network as one flight: on one time line, flown again, and judged."""
+"""The bags of agents on a network as one flight: put on one time line, and together to one log."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Life = tuple[int, int]  # an agent's id, and which of its processes: 0, 1, ...
+Process = tuple[int, int]  # an agent's id, and which of its processes: 0, 1, ...
 
 _MOST_FRAMES = 40_000  # in the fit
 _ROUNDS = 6
@@ -30,8 +30,8 @@ _PPM = 1e6
 class Crossing:
     """A frame that one agent has sent and another one heard; times of their own clocks, ns."""
 
-    sender: Life
-    receiver: Life
+    sender: Process
+    receiver: Process
     sent_ns: int
     arrival_ns: int
 
@@ -54,11 +54,11 @@ class Clock:
 class TimeLine:
     """The clocks of agents that have heard each other, directly or by way of others."""
 
-    clocks: Mapping[Life, Clock]
+    clocks: Mapping[Process, Clock]
     residual_ns: NDArray[np.float64]  # of the frames in the fit
     left_out: int  # frames that were held up
     flight_ns: float  # time under way, as fitted; as supposed, if there are no clocks
-    groups: Sequence[tuple[Life, ...]]  # of all that share frames, connected both ways; the first has the clocks
+    groups: Sequence[tuple[Process, ...]]  # of all that share frames, connected both ways; the first has the clocks
 
     def summary(self) -> dict[str, Any]:
         """Offsets, drifts and residuals as plain values."""
@@ -66,11 +66,11 @@ class TimeLine:
         zero_ns = self.clocks[min(self.clocks)].coarse_ns if self.clocks else 0
         return {
             "clocks": {
-                named(life): {
+                process_name(process): {
                     "offset_ms": (clock.coarse_ns - zero_ns + clock.offset_ns) / 1e6,
                     "drift_ppm": clock.drift * _PPM,
                 }
-                for life, clock in sorted(self.clocks.items())
+                for process, clock in sorted(self.clocks.items())
             },
             "frames": len(size),
             "frames_left_out": self.left_out,
@@ -82,9 +82,9 @@ class TimeLine:
         }
 
 
-def named(life: Life) -> str:
+def process_name(process: Process) -> str:
     """How an agent's process is called."""
-    return f"cf{life[0]}" + (f" ({life[1] + 1})" if life[1] else "")
+    return f"cf{process[0]}" + (f" ({process[1] + 1})" if process[1] else "")
 
 
 def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
@@ -95,7 +95,7 @@ def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
     if not coarse:
         return TimeLine({}, np.zeros(0), 0, float(flight_ns), groups)
     ids = sorted(coarse)
-    column = {life: k for k, life in enumerate(ids)}
+    column = {process: k for k, process in enumerate(ids)}
     sender = np.array([column[c.sender] for c in rows])
     receiver = np.array([column[c.receiver] for c in rows])
     sent = np.array([c.sent_ns - coarse[c.sender] for c in rows], dtype=np.float64)
@@ -104,40 +104,40 @@ def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
     good, solution = np.ones(len(rows), dtype=np.bool_), np.zeros(matrix.shape[1])
     for _ in range(_ROUNDS):
         solution = np.linalg.lstsq(matrix[good], late[good], rcond=None)[0]
-        rest = late - matrix @ solution
-        spread = 1.4826 * float(np.median(np.abs(rest[good])))
-        kept = np.abs(rest) <= max(_SIGMAS * spread, _LEAST_NS)
+        residual = late - matrix @ solution
+        spread = 1.4826 * float(np.median(np.abs(residual[good])))
+        kept = np.abs(residual) <= max(_SIGMAS * spread, _LEAST_NS)
         if (kept == good).all() or not kept.any():
             break
         good = kept
     solution = np.concatenate(([0.0, 0.0], solution))
     clocks = {
-        life: Clock(coarse[life], float(solution[2 * k]), float(solution[2 * k + 1]) / 1e9)
-        for life, k in column.items()
+        process: Clock(coarse[process], float(solution[2 * k]), float(solution[2 * k + 1]) / 1e9)
+        for process, k in column.items()
     }
-    rest = (late - matrix @ solution[2:])[good]
-    return TimeLine(clocks, rest, int((~good).sum()), flight_ns + float(solution[-1]), groups)
+    residual = (late - matrix @ solution[2:])[good]
+    return TimeLine(clocks, residual, int((~good).sum()), flight_ns + float(solution[-1]), groups)
 
 
-def both_ways(crossings: Sequence[Crossing]) -> list[tuple[Life, ...]]:
+def both_ways(crossings: Sequence[Crossing]) -> list[tuple[Process, ...]]:
     """Groups of processes between any two of which frames go both ways, directly or by way of others."""
     pairs = {(c.sender, c.receiver) for c in crossings}
-    lives = sorted({life for pair in pairs for life in pair})
-    column = {life: k for k, life in enumerate(lives)}
-    reaches = np.eye(len(lives), dtype=np.float32)
+    processes = sorted({process for pair in pairs for process in pair})
+    column = {process: k for k, process in enumerate(processes)}
+    reaches = np.eye(len(processes), dtype=np.float32)
     for sender, receiver in pairs:
         reaches[column[sender], column[receiver]] = 1.0
-    for _ in range(len(lives).bit_length()):  # each round doubles the frames that a way may have
+    for _ in range(len(processes).bit_length()):  # each round doubles the frames that a way may have
         reaches = (reaches @ reaches > 0).astype(np.float32)
     mutual = (reaches > 0) & (reaches.T > 0)
-    groups = {tuple(lives[k] for k in np.flatnonzero(row)) for row in mutual}
+    groups = {tuple(processes[k] for k in np.flatnonzero(row)) for row in mutual}
     return sorted(groups, key=lambda group: (-len(group), group))
 
 
-def _used(crossings: Sequence[Crossing], group: set[Life]) -> list[Crossing]:
+def _used(crossings: Sequence[Crossing], group: set[Process]) -> list[Crossing]:
     """The frames of the fit: those within a group, and of many every k-th of each pair, so that both ways stay."""
     within = [c for c in crossings if c.sender in group and c.receiver in group]
-    every, seen, used = max(1, len(within) // _MOST_FRAMES), Counter[tuple[Life, Life]](), []
+    every, seen, used = max(1, len(within) // _MOST_FRAMES), Counter[tuple[Process, Process]](), []
     for c in within:
         if seen[c.sender, c.receiver] % every == 0:
             used.append(c)
@@ -159,9 +159,9 @@ def _equations(
     return matrix[:, 2:]
 
 
-def _coarse(crossings: Sequence[Crossing], flight_ns: int) -> dict[Life, int]:
+def _coarse(crossings: Sequence[Crossing], flight_ns: int) -> dict[Process, int]:
     """What each clock shows at about the same time, from frame to frame; empty without frames."""
-    pairs: dict[tuple[Life, Life], list[int]] = {}
+    pairs: dict[tuple[Process, Process], list[int]] = {}
     for c in crossings:
         pairs.setdefault((c.sender, c.receiver), []).append(c.arrival_ns - c.sent_ns - flight_ns)
     if not pairs:
@@ -171,10 +171,10 @@ def _coarse(crossings: Sequence[Crossing], flight_ns: int) -> dict[Life, int]:
     start = min(c.sent_ns if c.sender == first else c.arrival_ns for c in crossings if first in (c.sender, c.receiver))
     found, waiting = {first: start}, [first]
     while waiting:
-        life = waiting.pop()
+        process = waiting.pop()
         for (sender, receiver), by in ahead.items():
             for known, new, sign in ((sender, receiver, 1), (receiver, sender, -1)):
-                if known == life and new not in found:
-                    found[new] = found[life] + sign * by
+                if known == process and new not in found:
+                    found[new] = found[process] + sign * by
                     waiting.append(new)
     return found

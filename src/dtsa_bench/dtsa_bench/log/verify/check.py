@@ -12,17 +12,17 @@ from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.writer import BROKEN_OFF
-from dtsa_bench.log.agent_bag import find_bags
-from dtsa_bench.log.merged_bag import merge_bags
+from dtsa_bench.log.agent_bag import find_bags, read_all
+from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, build_log, check_format
-from dtsa_bench.log.rules import Judge
+from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.config import LOCKSTEP, REALTIME
-from dtsa_bench.runs.hearing import recorded_problem
+from dtsa_bench.runs.delivery import recorded_problem
 
 from .contents import EVENTS, MERGED, BagContents
-from .lockstep import LockstepCheck
+from .lockstep import check_lockstep
 from .merged import check_merged
-from .realtime import RealtimeCheck
+from .realtime import check_realtime
 from .result import Difference, Mismatch, Result
 
 
@@ -68,21 +68,25 @@ def _noting(result: Result, check: Callable[[], None]) -> None:
         result.difference = Difference("a message", "valid CDR of its type", "other bytes", str(error))
 
 
-def _verify_agents(bags: Sequence[Path], result: Result) -> None:
+def _verify_agents(paths: Sequence[Path], result: Result) -> None:
     """The agents' bags of a flight, joined."""
-    check_merged(merge_bags(bags), result)
+    bags, nothing_written = read_all(paths)
+    check_merged(Merge(bags, nothing_written).log, result)
+    for bag in bags:
+        if bag.damage:
+            raise UnusableBag(bag.path, bag.damage)
 
 
 def _check_sniffed(log: FlightArrays, result: Result) -> None:
     """What a listener heard: frames tell of themselves whether they keep to the rules."""
-    judge, slots = Judge(log.config.swarm), log.sent_frames
+    judge, slots = RuleChecker(log.config.swarm), log.sent_frames
     frames: dict[int, dict[int, bytes]] = {}
     for row, sender, data in zip(slots.row.tolist(), slots.sender.tolist(), slots.data, strict=True):
         frames.setdefault(row + log.first_slot, {})[sender] = data
     for slot in sorted(frames):
-        judge.slot(slot, frames[slot])
+        judge.check_slot(slot, frames[slot])
     result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
-    result.take_judgement(judge)
+    result.note_rules(judge)
     result.skipped["decisions"] = "a listener does not know them"
 
 
@@ -101,13 +105,12 @@ def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) ->
     elif mode == SNIFFER:
         _check_sniffed(log, result)
     elif mode == LOCKSTEP:
-        LockstepCheck(log, contents, result, progress).check()
+        check_lockstep(log, contents, result, progress)
     else:
-        RealtimeCheck(log, contents, result).check()
+        check_realtime(log, contents, result)
     contents.check_odometry(log)
     contents.check_digest()
+    bag.check_files()
     for topic in bag.topics:
         if topic not in (SLOT_RECORD, EVENTS) and not topic.endswith("/odom"):
             result.skipped[topic] = "carries nothing that is not in other topics; covered by the digest"
-
-

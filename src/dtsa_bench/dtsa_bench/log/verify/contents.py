@@ -10,10 +10,11 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import RUN_MESSAGES
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.cdr import OdometryPacker
+from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import RUN_ID
-from dtsa_bench.log.bag.reader import Bag, Message
-from dtsa_bench.log.bag.writer import KEY, BagDigest
-from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, record_decoder
+from dtsa_bench.log.bag.reader import Bag, BagMessage
+from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest
+from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER
 
 from .result import Difference, Mismatch, Result
 
@@ -24,21 +25,25 @@ MERGED = "merged"
 class BagContents:
     """The messages of a bag in one pass: records, changes of the channel, odometry, and the digest of all.
 
+    Of a bag of which a part is lost, records count up to there: those that follow depend on what is lost.
+
     :raises Mismatch: if times, numbers or the run's id of a message are wrong, or one is missing.
     """
 
     def __init__(self, bag: Bag, slot_ns: int, agents: int, result: Result) -> None:
-        self._bag, self._slot_ns, self._result = bag, slot_ns, result
-        self._decode = record_decoder(bag)
+        self._slot_ns, self._agents, self._result = slot_ns, agents, result
+        self._decode = bag.decode
         self.records: list[Any] = []
         self.changes: list[tuple[int, dict[str, Any]]] = []  # slot, values
         self._odometry: list[tuple[int, int, bytes]] = []  # slot, agent, message
         self._digest, self._recorded = BagDigest(), bag.custom_data.get(KEY)
-        self._agents = agents
         self._partial, self._whole = result.mode in (AGENT, SNIFFER), result.mode not in (AGENT, SNIFFER, MERGED)
+        self._whole_ns = 1 << 63  # log time up to which nothing is lost
+        if result.broken_off:
+            self._whole_ns = _number(bag, BROKEN_OFF)
         sequences: dict[str, int] = {}
         topics = {name: (name.encode(), info.type in RUN_MESSAGES) for name, info in bag.topics.items()}
-        run = int(bag.custom_data.get(RUN_ID, "0"), 16)
+        run = _number(bag, RUN_ID, 16) if RUN_ID in bag.custom_data else 0
         for message in bag.messages():
             encoded, has_run = topics[message.topic]
             times = message.log_time_ns, message.publish_time_ns
@@ -50,6 +55,8 @@ class BagContents:
                 why = "messages of a topic are numbered one after the other"
                 what = f"{message.topic}, sequence number"
                 raise Mismatch(Difference(what, str(expected), str(message.sequence), why, slot))
+            if message.log_time_ns > self._whole_ns:
+                continue
             if message.topic == SLOT_RECORD:
                 self._add_record(message, run)
             elif message.topic == EVENTS:
@@ -61,7 +68,7 @@ class BagContents:
                 agent = message.topic.split("/")[1][2:]
                 self._odometry.append((slot, int(agent) if agent.isdigit() else 0, message.data))
 
-    def _add_record(self, message: Message, run: int) -> None:
+    def _add_record(self, message: BagMessage, run: int) -> None:
         record = self._decode(message)
         slot, stamp = int(record.slot), record.header.stamp
         right = message.log_time_ns if self._partial else names.slot_time_ns(slot, self._slot_ns)
@@ -75,13 +82,21 @@ class BagContents:
             if expected != recorded and not (what == "run" and not run):
                 why = "slots start one slot length after the other" if what != "run" else "the run's id"
                 raise Mismatch(Difference(f"slot record, {what}", str(expected), str(recorded), why, slot))
-        before = int(self.records[-1].slot) if self.records else None
-        if before is not None and slot != before + 1 and not self._partial:
+        following = int(self.records[-1].slot) + 1 if self.records else 0
+        if slot != following and (self._whole or (self.records and not self._partial)):
+            if self._result.broken_off and slot > following:  # in real time records are written after other messages
+                self._whole_ns = message.log_time_ns - 1
+                return
             why = "each slot has one record"
-            raise Mismatch(Difference("slot record", f"one of slot {before + 1}", f"slot {slot}", why, before + 1))
-        if before is None and slot and self._whole:
-            raise Mismatch(Difference("slot record", "one of slot 0", f"slot {slot}", "each slot has one record", 0))
+            raise Mismatch(Difference("slot record", f"one of slot {following}", f"slot {slot}", why, following))
         self.records.append(record)
+
+    def changes_by_slot(self) -> dict[int, dict[str, Any]]:
+        """New values of the channel's settings, by the first slot in which they hold."""
+        found: dict[int, dict[str, Any]] = {}
+        for slot, values in self.changes:
+            found.setdefault(slot, {}).update(values)
+        return found
 
     def check_odometry(self, log: FlightArrays) -> None:
         """Whether odometry is where the records say that the agents were."""
@@ -117,6 +132,14 @@ class BagContents:
         self._result.count("digest of all messages")
 
 
+def _number(bag: Bag, key: str, base: int = 10) -> int:
+    """A whole number in custom data."""
+    try:
+        return int(bag.custom_data[key][:20], base)
+    except ValueError:
+        raise UnusableBag(bag.given, f"{key} in its metadata is no number: {bag.custom_data[key][:20]!r}") from None
+
+
 def parameter_value(value: Any) -> Any:
     """A rcl_interfaces/ParameterValue as a plain value."""
     fields = {1: "bool_value", 2: "integer_value", 3: "double_value", 4: "string_value"}
@@ -133,5 +156,3 @@ def recorded_summary(log: FlightArrays, result: Result) -> dict[str, Any]:
         result.skipped["summary.json"] = "not beside the bag"
         return {}
     return dict(json.loads(path.read_text(encoding="utf-8")))
-
-

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core import REASONS, RemoteProtocolError, decode_frame
 from dtsa_agent.core.frame import EXTENDED_LENGTH, EXTENT_M, LENGTHS, TAG_LENGTH, ExtendedFrame, decode_extended
 from dtsa_bench.log.arrays import FlightArrays
+from dtsa_bench.log.replay import DecisionDifference
 
 from .result import Difference, Mismatch
 
@@ -47,14 +48,29 @@ def first_difference(
     shown = [repr(value) for value in values]
     why = WHY.get(name, "it follows from the agents' records")
     if name == "reason":
-        shown = [f"{code} ({REASONS[code] if code < len(REASONS) else 'no reason'})" for code in values]
+        shown = [_reason_text(code) for code in values]
     if name == "chosen":
         code = int(log.reason[row, place[-1]])
         why = f"{why}; reason: {REASONS[code] if code < len(REASONS) else code}"
     return row, Mismatch(Difference(name, *shown, why, row, agent))
 
 
+def decision_difference(found: DecisionDifference, log: FlightArrays, why: str) -> Mismatch:
+    """A decision of a replayed agent that is not as recorded."""
+    values: list[Any] = [found.expected, found.recorded]
+    if found.field == "frame":
+        shown = [describe_frame(data, log.config.swarm.extent_m) if data else "none" for data in values]
+    else:
+        shown = [_reason_text(code) if found.field == "reason" else repr(code) for code in values]
+    return Mismatch(Difference(found.field, *shown, why, found.slot, found.agent))
+
+
+def _reason_text(code: int) -> str:
+    return f"{code} ({REASONS[code] if code < len(REASONS) else 'no reason'})"
+
+
 def frame_difference(expected: dict[int, bytes], recorded: dict[int, bytes], row: int, extent_m: float) -> Mismatch:
+    """The first frame of a slot that is not as expected; frames by the sender's id."""
     sender = next(agent for agent in sorted({*expected, *recorded}) if expected.get(agent) != recorded.get(agent))
     shown = [
         describe_frame(frames[sender], extent_m) if sender in frames else "none" for frames in (expected, recorded)
@@ -88,5 +104,3 @@ def _extension(frame: ExtendedFrame) -> str:
     words += [f"relays {', '.join(f'+{ahead}: {lessee}' for ahead, lessee in frame.relay)}"] if frame.relay else []
     words += [f"hands on to {frame.far_lessee}: {', '.join(f'+{ahead}' for ahead in frame.far)}"] if frame.far else []
     return "".join(f", {word}" for word in words)
-
-

@@ -7,148 +7,109 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dtsa_bench.log.arrays import FlightArrays, LogBuilder
+from dtsa_agent.core.station import check_slotted
+from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.errors import UnusableBag
-from dtsa_bench.log.replay import replay_lockstep
-from dtsa_bench.log.rules import Judge
-from dtsa_bench.runs.hearing import Hearing
+from dtsa_bench.log.flight_log import log_of_flight
+from dtsa_bench.log.rules import RuleChecker
+from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import FlightMetrics, may_share
+from dtsa_bench.simulation.simulate import simulate
 
 from .contents import BagContents, recorded_summary
 from .differences import WHY, first_difference, frame_difference
 from .result import Difference, Mismatch, Result
 
-_BLOCK = 128  # slots that are compared at once
 _NOT_COMPARED = ("wall_time_s", "realtime_factor", "unusable_messages", "not_taken_in")
 _ARRAYS = ("length", "chosen", "reason", "digest", "score", "track", "velocity", "command", "goal", "outcome", "lost",
            "collided")  # fmt: skip
 
 
-class LockstepCheck:
-    """A flight in lockstep: everything follows from its configuration, so everything must be equal."""
+def check_lockstep(
+    log: FlightArrays, contents: BagContents, result: Result, progress: Callable[[int], None] | None
+) -> None:
+    """Fly the flight again, from its configuration alone, and compare all slots.
 
-    def __init__(
-        self, log: FlightArrays, contents: BagContents, result: Result, progress: Callable[[int], None] | None
-    ) -> None:
-        self._log, self._contents, self._result, self._progress = log, contents, result, progress
-        self.run = log.config
-        self._frames = log.sent_frames
-        self._starts = np.searchsorted(self._frames.row, np.arange(len(log) + 1)).tolist()
-        self._agreement, self._crowded = True, 0  # all chose alike in every slot; slots with more than one sender
-
-    def check(self) -> None:
-        """Compare all slots.
-
-        :raises Mismatch: at the first difference.
-        """
-        log, result, run = self._log, self._result, self.run
-        changes: dict[int, dict[str, Any]] = {}
-        for slot, values in self._contents.changes:
-            changes.setdefault(slot, {}).update(values)
-        builder, judge = LogBuilder(run), Judge(run.swarm)
-        done, swarm, hearing = 0, None, Hearing(log.agents)
-        metrics: FlightMetrics | None = None
-        try:
-            for row, swarm, verdict in replay_lockstep(run, len(log), changes, builder, hearing):
-                if metrics is None:
-                    metrics = FlightMetrics(run, swarm.scenario)
-                assert verdict is not None
-                frames = builder.frames[row]
-                self._crowded += len(frames) > 1
-                metrics.compare_tables(row, swarm.digest, swarm.chosen)
-                self._agreement = self._agreement and bool((swarm.chosen == swarm.chosen[0]).all())
-                judge.slot(row, frames)
-                metrics.update(row, swarm.track, swarm, verdict.outcome, [len(data) for data in frames.values()])
-                if row + 1 - done == _BLOCK:
-                    self._compare(builder, done, row + 1)
-                    done = row + 1
-                    if self._progress is not None:
-                        self._progress(row)
-            self._compare(builder, done, len(log))
-            done = len(log)
-        except Mismatch as mismatch:
-            done = mismatch.difference.slot or 0
-            raise
-        finally:  # those that are equal, wherever it ends
-            result.slots = done
-            result.simulated_s = done * run.swarm.slot_s
-            self._count(done)
-        if swarm is None or metrics is None:
-            raise UnusableBag(str(log.file), "it holds no whole slot")
-        self._check_track(len(log), swarm.track)
-        self._check_summary(metrics)
-        result.unheard = hearing.problem()
-        self._note_safety(metrics, judge)
-
-    def _count(self, slots: int) -> None:
-        if slots:
-            result = self._result
-            result.count("slot records", slots)
-            result.count("decisions", slots * self._log.agents)
-            result.count("frames", self._starts[slots])
-
-    def _compare(self, builder: LogBuilder, first: int, last: int) -> None:
-        """Compare some slots.
-
-        :raises Mismatch: at the first difference.
-        """
-        log, part = self._log, slice(first, last)
-        found: list[tuple[int, Mismatch]] = []
-        if not log.known[part].all():
-            row, column = (int(index[0]) for index in np.nonzero(~log.known[part]))
-            raise Mismatch(Difference("agent", "an account", "none", WHY["known"], first + row, column + 1))
-        for name in _ARRAYS:
-            expected, recorded = builder.arrays[name][part], getattr(log, name)[part]
-            if expected.tobytes() != recorded.tobytes():
-                found.append(first_difference(name, expected, recorded, first, log))
-        for row in range(first, last):
-            expected_frames, a, b = builder.frames[row], self._starts[row], self._starts[row + 1]
-            sent = dict(zip(self._frames.sender[a:b].tolist(), self._frames.data[a:b], strict=True))
-            if expected_frames != sent:
-                found.append((row, frame_difference(expected_frames, sent, row, self.run.swarm.extent_m)))
-                break
-            if builder.received[row].tobytes() != log.received[a:b].tobytes():
-                frame, column = (int(index[0]) for index in np.nonzero(builder.received[row] != log.received[a:b]))
-                values = [str(bool(mask[frame, column])) for mask in (builder.received[row], log.received[a:b])]
-                sender = int(self._frames.sender[a + frame])
-                what = f"received, frame of cf{sender}"
-                found.append((row, Mismatch(Difference(what, *values, WHY["received"], row, column + 1))))
-                break
-        if found:
-            raise min(found, key=lambda entry: entry[0])[1]
-
-    def _check_track(self, row: int, expected: NDArray[np.float64]) -> None:
-        """Where all were at the end of the last slot."""
-        recorded = self._log.track[row]
-        if expected.tobytes() != recorded.tobytes():
-            raise first_difference("track", expected[None], recorded[None], row, self._log)[1]
-
-    def _check_summary(self, metrics: FlightMetrics) -> None:
-        recorded = recorded_summary(self._log, self._result)
-        for key, value in json.loads(json.dumps(metrics.summary())).items():
-            if key in _NOT_COMPARED or key not in recorded or (key == "end" and recorded[key] == "stopped"):
-                continue
-            if recorded[key] != value:
-                why = "computed from the recorded flight"
-                raise Mismatch(Difference(f"summary.json: {key}", str(value), str(recorded[key]), why))
-            self._result.count("summary.json")
-
-    def _note_safety(self, metrics: FlightMetrics, judge: Judge) -> None:
-        closest, pair = metrics.closest()
-        result = self._result
-        result.safety = {
-            "slots_with_two_senders": self._crowded,
-            "all_agents_chose_alike": self._agreement,
-            "closest_pair_m": closest,
-            "closest_pair": list(pair),
-            "crashed": metrics.crash_slot >= 0,
-        }
-        result.take_judgement(judge)
-        lossless = may_share(self.run) and not self._contents.changes
-        if lossless and (self._crowded or not self._agreement):
-            why = "without loss all agents hear the same and choose the same"
-            raise Mismatch(Difference("two senders in one slot", "never", f"{self._crowded} slots", why))
+    :raises Mismatch: at the first difference.
+    :raises ConfigError: for a policy without slots.
+    """
+    run, changes = log.config, contents.changes_by_slot()
+    check_slotted(run.swarm.policy)
+    if not len(log):
+        raise UnusableBag(str(log.file), "it holds no whole slot")
+    flight = simulate(
+        run, shared_table=False, log=True, frames=True, slots=len(log), changes=changes, progress=progress
+    )
+    expected = log_of_flight(flight)
+    difference = _first_mismatch(log, expected)
+    slots = len(log) if difference is None else difference.difference.slot or 0
+    result.slots, result.simulated_s = slots, slots * run.swarm.slot_s  # those that are equal, wherever it ends
+    if slots:
+        result.count("slot records", slots)
+        result.count("decisions", slots * log.agents)
+        result.count("frames", int(log.sent[:slots].sum()))
+    if difference is not None:
+        raise difference
+    _check_summary(log, result, flight.metrics)
+    delivered = int(log.received.sum())
+    result.unheard = DeliveryCounts(log.agents, slots, int(log.sent.sum()), delivered, delivered).problem()
+    _check_safety(expected, result, flight.metrics, lossless=may_share(run) and not changes)
 
 
+def _first_mismatch(log: FlightArrays, expected: FlightArrays) -> Mismatch | None:
+    """The difference in the earliest slot; None: all is equal."""
+    if not log.known.all():
+        row, column = (int(index[0]) for index in np.nonzero(~log.known))
+        return Mismatch(Difference("agent", "an account", "none", WHY["known"], row, column + 1))
+    found: list[tuple[int, Mismatch]] = []
+    for name in _ARRAYS:
+        right, recorded = getattr(expected, name), getattr(log, name)
+        if right.tobytes() != recorded.tobytes():
+            found.append(first_difference(name, right, recorded, 0, log))
+    frames, recorded_frames = expected.sent_frames, log.sent_frames
+    if frames.data != recorded_frames.data:
+        pairs = zip(frames.data, recorded_frames.data, strict=False)
+        at = next((k for k, (one, other) in enumerate(pairs) if one != other), 0)
+        row = int(min(frames.row[at : at + 1].tolist() + recorded_frames.row[at : at + 1].tolist(), default=0))
+        sent = [{k + 1: part.frame(row, k + 1) for k in np.flatnonzero(part.length[row]).tolist()}
+                for part in (expected, log)]  # fmt: skip
+        if sent[0] != sent[1]:
+            found.append((row, frame_difference(*sent, row, log.config.swarm.extent_m)))
+    if len(frames.row) == len(recorded_frames.row) and (frames.received != log.received).any():
+        k, column = (int(index[0]) for index in np.nonzero(frames.received != log.received))
+        row, sender = int(frames.row[k]), int(frames.sender[k])
+        values = [str(bool(mask[k, column])) for mask in (frames.received, log.received)]
+        what = f"received, frame of cf{sender}"
+        found.append((row, Mismatch(Difference(what, *values, WHY["received"], row, column + 1))))
+    return min(found, key=lambda entry: entry[0])[1] if found else None
+
+
+def _check_summary(log: FlightArrays, result: Result, metrics: FlightMetrics) -> None:
+    recorded = recorded_summary(log, result)
+    for key, value in json.loads(json.dumps(metrics.summary())).items():
+        if key in _NOT_COMPARED or key not in recorded or (key == "end" and recorded[key] == "stopped"):
+            continue
+        if recorded[key] != value:
+            why = "computed from the recorded flight"
+            raise Mismatch(Difference(f"summary.json: {key}", str(value), str(recorded[key]), why))
+        result.count("summary.json")
+
+
+def _check_safety(log: FlightArrays, result: Result, metrics: FlightMetrics, lossless: bool) -> None:
+    judge, closest = RuleChecker(log.config.swarm), metrics.closest()
+    for row in range(len(log)):
+        senders = np.flatnonzero(log.length[row]).tolist()
+        judge.check_slot(row, {sender + 1: log.frame(row, sender + 1) for sender in senders})
+    crowded, agreement = int((log.sent.sum(axis=1) > 1).sum()), bool((log.chosen == log.chosen[:, :1]).all())
+    result.safety = {
+        "slots_with_two_senders": crowded,
+        "all_agents_chose_alike": agreement,
+        "closest_pair_m": closest[0],
+        "closest_pair": list(closest[1]),
+        "crashed": metrics.crash_slot >= 0,
+    }
+    result.note_rules(judge)
+    if lossless and (crowded or not agreement):
+        why = "without loss all agents hear the same and choose the same"
+        raise Mismatch(Difference("two senders in one slot", "never", f"{crowded} slots", why))

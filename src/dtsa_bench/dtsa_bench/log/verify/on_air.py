@@ -14,7 +14,7 @@ from dtsa_agent.core.delays import Delays
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
 
-from dtsa_bench.log.arrays import FlightArrays, HeardFrames
+from dtsa_bench.log.arrays import FlightArrays, ReceivedFrames
 from .result import Difference, Mismatch
 
 Mask = NDArray[np.bool_]
@@ -103,7 +103,7 @@ class FramesOnAir:
     def wait_for_lines(self) -> None:
         """Find when frames began and arrived whose radios hand over one reception after the other."""
         in_order = sorted(self._sent.values(), key=lambda sent: sent.asked_ns)
-        for verdict in self._settled(_RecordedMedium(self.config, in_order)):
+        for verdict in self._verdicts(_RecordedMedium(self.config, in_order)):
             sent = self._sent[verdict.frame_id]
             sent.on_air = OnAir.of(self.config.airtime, sent.sender, verdict.start_ns, len(sent.data))
             sent.arrival_ns = verdict.arrival_ns
@@ -155,30 +155,32 @@ class FramesOnAir:
             raise Mismatch(Difference("received", f"without cf{one.sender}", _ids(other.received),
                                       "who sends does not hear", other.slot, other.sender))  # fmt: skip
 
-    def check_verdicts(self, changes: Sequence[tuple[int, dict[str, Any]]]) -> int:
+    def check_verdicts(self, changes: Sequence[tuple[int, dict[str, Any]]], until_ns: int | None = None) -> int:
         """Make all verdicts again from the frames, their times and the channel's seed; returns how many.
 
         :param changes: first slot and values of each change of the channel's settings.
+        :param until_ns: only those on frames that have left the air by then; None: all.
         :raises Mismatch: at the first that is not equal.
         """
         channel = Channel(self.config)
         for slot, values in changes:
             channel.set(slot=slot, **values)
-        again = self._on_one_time_line(channel) if self.own_clocks else self._by_slots(channel)
-        for key in sorted(again):
+        again = self._by_times(channel) if self.own_clocks else self._by_slots(channel)
+        keys = [key for key in again if until_ns is None or self._sent[key].on_air.end_ns <= until_ns]
+        for key in sorted(keys):
             sent = self._sent[key]
             for name, one, other in zip(("received", "lost", "collided"), again[key], sent.verdict, strict=True):
                 expected, recorded = (_ids(one), _ids(other)) if name == "received" else (str(one), str(other))
                 if expected != recorded:
                     why = "overlap on the time line, and the channel's draw from its seed"
                     raise Mismatch(Difference(name, expected, recorded, why, sent.slot, sent.sender))
-        return len(again)
+        return len(keys)
 
-    def _on_one_time_line(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
-        settled = self._settled(channel)
+    def _by_times(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
+        settled = self._verdicts(channel)
         return {verdict.frame_id: (verdict.received, verdict.lost, verdict.collided) for verdict in settled}
 
-    def _settled(self, media: Any) -> Iterator[FrameVerdict[tuple[int, int]]]:
+    def _verdicts(self, media: Any) -> Iterator[FrameVerdict[tuple[int, int]]]:
         """The verdicts on all frames on one time line."""
         air: Air[tuple[int, int]] = Air(media)
         waiting = deque(sorted(self._sent.items(), key=lambda item: item[1].asked_ns))
@@ -208,7 +210,7 @@ class FramesOnAir:
         """A frame; None if it was not sent."""
         return self._sent.get((slot, sender))
 
-    def check_heard(self, heard: HeardFrames, slots: int) -> tuple[int, dict[str, Any]]:
+    def check_received(self, heard: ReceivedFrames, slots: int) -> tuple[int, dict[str, Any]]:
         """Whether agents took in what was delivered to them, once, and not before it was.
 
         :param slots: how many the log has.

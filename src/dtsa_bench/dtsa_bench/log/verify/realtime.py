@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from typing import Any
 
@@ -21,133 +20,128 @@ from dtsa_agent.core.frame import (
 )
 from dtsa_agent.keys import VARIABLE
 from dtsa_bench.log.arrays import FlightArrays
-from dtsa_bench.log.replay import replay_log
-from dtsa_bench.log.rules import Judge
+from dtsa_bench.log.replay import AgentReplay
+from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.config import REALTIME, RunConfig
-from dtsa_bench.runs.hearing import Hearing
+from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 from .contents import BagContents, recorded_summary
-from .differences import WHY, first_difference
+from .differences import WHY, decision_difference
 from .on_air import FramesOnAir
 from .result import Difference, Mismatch, Result
 
 _SLOT_MASK = 0xFFFFFFFF  # slots have 32 bits in frames
 
 
-class RealtimeCheck:
-    """A flight that cannot be flown again bit for bit, because it depends on when things happened.
+def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> None:
+    """Check a flight that cannot be flown again bit for bit, because it depends on when things happened.
 
     What frames, times, verdicts and decisions must have in common is checked all the same.
+
+    :raises Mismatch: at the first difference.
     """
+    own_clocks = result.mode == REALTIME
+    run = RunConfig.from_dict({**log.settings, "mode": REALTIME})  # missions say what they fly with instead of a mode
+    frames, own_states = FramesOnAir.of_log(log, run.air, own_clocks), OwnStates(run.swarm, result)
+    result.slots, result.simulated_s = len(log), len(log) * run.swarm.slot_s
+    check_own_states(log, own_states)
+    result.count("slot records", len(log))
+    _check_outcomes(log)
+    frames.check_numbers()
+    result.count("frames that nobody heard together with another", frames.check_overlaps())
+    summary = _check_summary(log, result)
+    if own_clocks and (run.air.range_m or run.air.capture_db):
+        result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
+    else:
+        # Frames that are lost may have been on the air together with the last ones that are there.
+        until_ns = (len(log) - 1) * log.slot_ns if result.broken_off else None
+        result.count("verdicts made again", frames.check_verdicts(contents.changes, until_ns))
+    if own_clocks:
+        _check_decisions(log, frames, own_states, result, summary)
+    else:
+        result.skipped["decisions and motion"] = (
+            "they depend on when each message reached each process, which the bag does not hold"
+        )
+    _check_rules(log, run.swarm, frames, result)
+    result.safety |= frames.safety()
+    if own_clocks:
+        result.safety |= _clock_spread(log)
 
-    def __init__(self, log: FlightArrays, contents: BagContents, result: Result) -> None:
-        self._log, self._contents, self._result = log, contents, result
-        self._own_clocks = result.mode == REALTIME
-        # Missions say what they fly with instead of a mode of runs.
-        self.run = RunConfig.from_dict({**log.settings, "mode": REALTIME})
-        self.frames = FramesOnAir.of_log(log, self.run.air, self._own_clocks)
 
-    def check(self) -> None:
-        """Go through the flight.
+def _check_outcomes(log: FlightArrays) -> None:
+    right = np.where(log.collided.any(axis=1), COLLISION, np.where(log.sent.any(axis=1), SUCCESS, IDLE))
+    wrong = np.flatnonzero(log.recorded & (right != log.outcome))
+    if len(wrong):
+        row = int(wrong[0])
+        raise Mismatch(Difference("outcome", str(right[row]), str(log.outcome[row]), WHY["outcome"], row))
 
-        :raises Mismatch: at the first difference.
-        """
-        log, result = self._log, self._result
-        result.slots, result.simulated_s = len(log), len(log) * self.run.swarm.slot_s
-        own_states = OwnStates(self.run.swarm, result)
-        check_own_states(log, own_states)
-        result.count("slot records", len(log))
-        self._check_outcomes()
-        self.frames.check_numbers()
-        result.count("frames that nobody heard together with another", self.frames.check_overlaps())
-        summary = self._summary()
-        if self._own_clocks and (self.run.air.range_m or self.run.air.capture_db):
-            result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
-        else:
-            result.count("verdicts made again", self.frames.check_verdicts(self._contents.changes))
-        if self._own_clocks:
-            self._check_decisions(own_states, summary)
-        else:
-            result.skipped["decisions and motion"] = (
-                "they depend on when each message reached each process, which the bag does not hold"
-            )
-        self._judge()
-        result.safety |= self.frames.safety()
-        if self._own_clocks:
-            self._note_spread()
 
-    def _check_outcomes(self) -> None:
-        log = self._log
-        right = np.where(log.collided.any(axis=1), COLLISION, np.where(log.sent.any(axis=1), SUCCESS, IDLE))
-        wrong = np.flatnonzero(log.recorded & (right != log.outcome))
-        if len(wrong):
-            row = int(wrong[0])
-            raise Mismatch(Difference("outcome", str(right[row]), str(log.outcome[row]), WHY["outcome"], row))
+def _check_decisions(
+    log: FlightArrays, frames: FramesOnAir, own_states: OwnStates, result: Result, summary: dict[str, Any]
+) -> None:
+    """What agents took in had been delivered to them, and their decisions follow from it."""
+    assert log.heard is not None
+    count, delays = frames.check_received(log.heard, len(log))
+    result.count("frames taken in as they were delivered", count)
+    delivery = DeliveryCounts(log.agents, len(log), int(log.sent.sum()), int(log.received.sum()), count)
+    result.unheard = delivery.problem(summary.get("not_taken_in"))
+    result.skipped["motion"] = "it depends on when in a slot each message reached each process"
+    auth = log.config.swarm.auth
+    if auth and not own_states.has_key:
+        result.skipped["decisions"] = f"no key in {VARIABLE}"
+    else:
+        result.count("decisions made again", compare_decisions(log, auth))
+    result.safety |= delays | {"stalls": summary.get("stalls", [])}
 
-    def _check_decisions(self, own_states: OwnStates, summary: dict[str, Any]) -> None:
-        """What agents took in had been delivered to them, and their decisions follow from it."""
-        log, result = self._log, self._result
-        assert log.heard is not None
-        count, delays = self.frames.check_heard(log.heard, len(log))
-        result.count("frames taken in as they were delivered", count)
-        hearing = Hearing(log.agents)
-        hearing.slots, hearing.sent = len(log), int(log.sent.sum())
-        hearing.delivered, hearing.taken_in = int(log.received.sum()), count
-        result.unheard = hearing.problem(summary.get("not_taken_in"))
-        result.skipped["motion"] = "it depends on when in a slot each message reached each process"
-        if self.run.swarm.auth and not own_states.has_key:
-            result.skipped["decisions"] = f"no key in {VARIABLE}"
-        else:
-            result.count("decisions made again", compare_decisions(log, self.run.swarm.auth))
-        result.safety |= delays | {"stalls": summary.get("stalls", [])}
 
-    def _judge(self) -> None:
-        """Whether the frames keep to the rules; those that came too late to be sent were made all the same."""
-        log, judge = self._log, Judge(self.run.swarm)
-        ids = np.arange(1, log.agents + 1)
-        unsent = log.known & (log.chosen == ids)
-        slots: dict[int, dict[int, bytes]] = {}
-        for sent in self.frames.all():
-            slots.setdefault(sent.slot, {})[sent.sender] = sent.data
-            unsent[sent.slot, sent.sender - 1] = False
-        for row in range(len(log)):
-            if row in slots or unsent[row].any():
-                judge.slot(row, slots.get(row, {}), unrecorded=ids[unsent[row]].tolist())
-        self._result.take_judgement(judge)
+def _check_rules(log: FlightArrays, config: SwarmConfig, frames: FramesOnAir, result: Result) -> None:
+    """Whether the frames keep to the rules; those that came too late to be sent were made all the same."""
+    rules, ids = RuleChecker(config), np.arange(1, log.agents + 1)
+    unsent = log.known & (log.chosen == ids)
+    slots: dict[int, dict[int, bytes]] = {}
+    for sent in frames.all():
+        slots.setdefault(sent.slot, {})[sent.sender] = sent.data
+        unsent[sent.slot, sent.sender - 1] = False
+    for row in range(len(log)):
+        if row in slots or unsent[row].any():
+            rules.check_slot(row, slots.get(row, {}), unrecorded=ids[unsent[row]].tolist())
+    result.note_rules(rules)
 
-    def _note_spread(self) -> None:
-        log, spread = self._log, []
-        here = log.known & ~log.sent  # a frame may leave late; the slot starts when it starts
-        for row in np.flatnonzero(here.sum(axis=1) > 1).tolist():
-            spread.append(int(np.ptp(log.offset_ns[row, here[row]])))
-        self._result.safety["clock_spread_max_ms"] = max(spread, default=0) / 1e6
-        self._result.safety["clock_spread_mean_ms"] = float(np.mean(spread)) / 1e6 if spread else 0.0
 
-    def _summary(self) -> dict[str, Any]:
-        found = recorded_summary(self._log, self._result)
-        recorded = found.get("slots", {}).get("total")
-        if recorded is not None and abs(recorded - len(self._log)) > 1:
-            raise Mismatch(Difference("summary.json: slots", str(len(self._log)), str(recorded), "each has a record"))
-        if found:
-            self._result.count("summary.json")
-        return found
+def _clock_spread(log: FlightArrays) -> dict[str, float]:
+    here = log.known & ~log.sent  # a frame may leave late; the slot starts when it starts
+    rows = np.flatnonzero(here.sum(axis=1) > 1).tolist()
+    spread = [int(np.ptp(log.offset_ns[row, here[row]])) for row in rows]
+    mean = float(np.mean(spread)) / 1e6 if spread else 0.0
+    return {"clock_spread_max_ms": max(spread, default=0) / 1e6, "clock_spread_mean_ms": mean}
+
+
+def _check_summary(log: FlightArrays, result: Result) -> dict[str, Any]:
+    found = recorded_summary(log, result)
+    recorded = found.get("slots", {}).get("total")
+    if recorded is not None and abs(recorded - len(log)) > 1:
+        raise Mismatch(Difference("summary.json: slots", str(len(log)), str(recorded), "each has a record"))
+    if found:
+        result.count("summary.json")
+    return found
 
 
 def compare_decisions(log: FlightArrays, tags: bool) -> int:
-    """Make the decisions of agents with clocks of their own again, and return how many are equal.
+    """Replay all agents, together, up to the first slot that one of them has not told of; return the equal decisions.
 
-    :raises Mismatch: at the first that is not.
+    :param tags: check the tags of frames.
+    :raises Mismatch: at the first that is not equal.
     """
-    equal, why = 0, "follows from what the agent says to have taken in"
-    for row, swarm in replay_log(log, tags):
-        for name in ("chosen", "reason", "digest", "score"):
-            expected, recorded = getattr(swarm, name), getattr(log, name)[row]
-            if expected.tobytes() != recorded.tobytes():
-                difference = first_difference(name, expected[None], recorded[None], row, log)[1].difference
-                raise Mismatch(dataclasses.replace(difference, reason=why))
-        equal += log.agents
-    return equal
+    replay = AgentReplay(log.config.swarm, range(1, log.agents + 1), tags)
+    for row in range(len(log)):
+        if not log.known[row].all():
+            break
+        replay.step(log, row)
+        if replay.differences:
+            why = "follows from what the agent says to have taken in"
+            raise decision_difference(replay.differences[0], log, why)
+    return replay.equal
 
 
 def check_own_states(log: FlightArrays, own_states: OwnStates) -> None:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from dtsa_bench.drawing.card import as_html, as_text
-from dtsa_bench.log.rules import Judge
+from dtsa_bench.log.rules import RuleChecker
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
     """The first place where a bag is not what the protocol gives."""
 
-    what: str  # what was compared, e.g. "transmission.chosen"
+    what: str  # what was compared, e.g. "chosen"
     expected: str
     recorded: str
     reason: str  # why the expected value is what it is
@@ -21,27 +21,9 @@ class Difference:
     agent: int | None = None  # id
 
     def __str__(self) -> str:
-        place = ", ".join(
-            text
-            for text in (
-                "" if self.slot is None else f"slot {self.slot}",
-                "" if self.agent is None else f"agent {self.agent}",
-            )
-            if text
-        )
-        where = f"{place}: " if place else ""
+        places = [f"{name} {place}" for name, place in (("slot", self.slot), ("agent", self.agent)) if place is not None]
+        where = f"{', '.join(places)}: " if places else ""
         return f"{where}{self.what}: expected {self.expected}, recorded {self.recorded} ({self.reason})"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return {
-            "slot": self.slot,
-            "agent": self.agent,
-            "what": self.what,
-            "expected": self.expected,
-            "recorded": self.recorded,
-            "reason": self.reason,
-        }
 
 
 class Mismatch(Exception):
@@ -76,11 +58,10 @@ class Result:
 
     @property
     def _title(self) -> str:
-        verdict = "everything is what the protocol gives" if self.ok else "NOT what the protocol gives"
-        cut = self.broken_off and self.ok
-        return f"{self.bag}: {verdict}" + (
-            f", up to slot {self.slots - 1}, where the recording breaks off" if cut else ""
-        )
+        if not self.ok:
+            return f"{self.bag}: NOT what the protocol gives"
+        cut = f", up to slot {self.slots - 1}, where the recording breaks off" if self.broken_off else ""
+        return f"{self.bag}: everything is what the protocol gives{cut}"
 
     def _rows(self) -> list[tuple[str, str]]:
         pace = self.simulated_s / self.wall_time_s if self.wall_time_s else 0.0
@@ -100,37 +81,24 @@ class Result:
         return self.difference is None
 
     def count(self, what: str, times: int = 1) -> None:
-        """Notes checks that passed."""
+        """Note checks that passed."""
         self.checked[what] = self.checked.get(what, 0) + times
 
-    def take_judgement(self, judge: Judge) -> None:
-        """Notes whether the frames kept to the policy's rules.
+    def note_rules(self, rules: RuleChecker) -> None:
+        """Note whether the frames kept to the policy's rules.
 
         :raises Mismatch: at the first rules that were broken.
         """
-        if not judge.knows_rules:
+        if not rules.has_rules:
             return
-        if judge.broken:
+        if rules.broken:
             why = "a turn is its owner's, or of the last one to whom it was given (docs/reference/protocol.md)"
-            raise Mismatch(Difference("frames", "none against the rules", "; ".join(judge.broken[:3]), why))
-        self.count("slots whose frames keep to the rules", judge.slots)
-        if judge.unjudged:
+            raise Mismatch(Difference("frames", "none against the rules", "; ".join(rules.broken[:3]), why))
+        self.count("slots whose frames keep to the rules", rules.slots)
+        if rules.unchecked:
             why = "they may depend on frames that were too late to be sent, and that nobody has recorded"
-            self.skipped["frames against the rules"] = f"in {judge.unjudged} slots: {why}"
+            self.skipped["frames against the rules"] = f"in {rules.unchecked} slots: {why}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
-        return {
-            "bag": self.bag,
-            "mode": self.mode,
-            "ok": self.ok,
-            "slots": self.slots,
-            "broken_off": self.broken_off,
-            "simulated_s": self.simulated_s,
-            "wall_time_s": self.wall_time_s,
-            "checked": self.checked,
-            "skipped": self.skipped,
-            "safety": self.safety,
-            "unheard": self.unheard or None,
-            "difference": self.difference.to_dict() if self.difference else None,
-        }
+        return {"bag": self.bag, "mode": self.mode, "ok": self.ok, **asdict(self), "unheard": self.unheard or None}

@@ -189,7 +189,7 @@ def fly_all(steps: Sequence[Sequence[DemoFlight]], directory: Path, stop: Stop) 
     line, failed, flown = ProgressLine("flights in lockstep"), threading.Event(), 0
     over = StopOr(stop, failed.is_set)
 
-    def fly_one(flight: DemoFlight) -> Flight | None:
+    def fly_demo_flight(flight: DemoFlight) -> Flight | None:
         nonlocal flown
         if over:
             return None
@@ -205,7 +205,7 @@ def fly_all(steps: Sequence[Sequence[DemoFlight]], directory: Path, stop: Stop) 
         return result
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        futures = [pool.submit(fly_one, flight) for flight in lockstep]
+        futures = [pool.submit(fly_demo_flight, flight) for flight in lockstep]
     line.end()
     results = zip(lockstep, [future.result() for future in futures], strict=True)
     finished = {flight.key: read_flight(flight, result) for flight, result in results if result is not None}

@@ -319,11 +319,11 @@ def draw_animation(path: Path, flights: Flights, slots: int = 80) -> None:
             canvas.draw()
             pictures.append(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
     durations = [FRAME_MS] * (slots - 1) + [LAST_FRAME_MS]
-    first, *rest = _with_one_palette(pictures)
+    first, *rest = _share_palette(pictures)
     first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
 
 
-def _with_one_palette(pictures: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:
+def _share_palette(pictures: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:
     """Pictures, (H, W, 3) each, in the 255 most frequent colours of the last: what does not move does not change."""
     colours, counts = np.unique(pictures[-1] @ _RGB, return_counts=True)
     palette = colours[np.argsort(-counts, kind="stable")[:255]][:, None] // _RGB % 256

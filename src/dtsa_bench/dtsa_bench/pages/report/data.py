@@ -1,8 +1,9 @@
-"""What a report shows of one run, reduced to what a page can hold and a screen can show."""
+"""The report of recorded runs: what it shows of each, reduced to what a screen can show, and its one HTML file."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import REASONS, Scenario
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.registry import REASON_TEXTS
+from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
-from dtsa_bench.log.knowledge import Ages
 from dtsa_bench.log.merged_bag import open_log
-from dtsa_bench.pages.html import BINS, flatten, pack, reduce_bins, thin
-from dtsa_bench.runs.hearing import recorded_problem, sentence
+from dtsa_bench.log.replay import MeanAges
+from dtsa_bench.pages.html import BINS, PALETTE, SCRIPTS, flatten, pack, reduce_bins, render_page, thin, write_page
+from dtsa_bench.runs.delivery import as_sentence, recorded_problem
 from dtsa_channel_sim.model.verdict import OUTCOMES
 
 from .distances import collision_m, distance_chart, list_crashes, pair_distances
@@ -24,6 +28,7 @@ SCENE_VALUES = 600_000  # most numbers in the replay: longer runs of larger swar
 UNKNOWN = -32768  # in the replay: it is not known where the agent was
 VEHICLE_VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
 MAX_EVENTS = 1000  # of a mission
+MAX_RUNS = 8  # side by side
 
 Array = NDArray[np.float64]
 
@@ -38,7 +43,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
     followed, scenario = run.knowledge, run.scenario
     ages = followed.ages
     notes = [*run.notes, *followed.notes]
-    told = sentence(recorded_problem(run.file or path))
+    told = as_sentence(recorded_problem(run.file or path))
     if told and not any(note.startswith(told.partition(":")[0]) for note in notes):
         notes.append(told)
     if unknown := int((run.recorded & ~run.outcome_known).sum()):
@@ -62,7 +67,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "slots": _slots(run),
         "channel": _channel_use(run),
         "decisions": _reasons(run),
-        "sent_for": _sent_for(run),
+        "sent_for": _reasons_sent(run),
         "distances": distance_chart(distances, run),
         "ages": _ages(ages, run),
         "table": _table(run, ages, scenario),
@@ -142,7 +147,7 @@ def _reason_names(run: FlightLog) -> list[str]:
     return [REASONS[code] if code < len(REASONS) else str(code) for code in _reason_codes(run).tolist()]
 
 
-def _sent_for(run: FlightLog) -> list[str]:
+def _reasons_sent(run: FlightLog) -> list[str]:
     """Reasons for which something was sent."""
     codes = np.unique(_sender_reason(run))
     names = _reason_names(run)
@@ -196,7 +201,7 @@ def _reasons(run: FlightLog) -> dict[str, Any] | None:
     }
 
 
-def _ages(ages: Ages | None, run: FlightLog) -> dict[str, Any] | None:
+def _ages(ages: MeanAges | None, run: FlightLog) -> dict[str, Any] | None:
     if ages is None or not len(run):
         return None
 
@@ -223,7 +228,7 @@ def _ages(ages: Ages | None, run: FlightLog) -> dict[str, Any] | None:
     }
 
 
-def _table(run: FlightLog, ages: Ages | None, scenario: Scenario | None) -> list[dict[str, Any]]:
+def _table(run: FlightLog, ages: MeanAges | None, scenario: Scenario | None) -> list[dict[str, Any]]:
     """One row an agent."""
     frames, path = run.sent_frames, run.path
     rows = []
@@ -273,3 +278,46 @@ def mission_data(path: str | Path) -> dict[str, Any] | None:
         return {"cut_short": str(mission["cut_short"]), "vehicles": vehicles, "events": events[:MAX_EVENTS]}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+# -- the page ---------------------------------------------------------------------------------------------------------
+def render(runs: Sequence[dict[str, Any]]) -> str:
+    """The page of what `run_data` gave for each run."""
+    title = " · ".join(run["name"] for run in runs) + " – DTSA report"
+    data = {"runs": list(runs), "palette": PALETTE, "reasons": dict(REASON_TEXTS)}
+    return render_page("report", title, (*SCRIPTS, "report.js"), data)
+
+
+def write_report(bags: Sequence[str | Path], out: str | Path, progress: Callable[[str], None] | None = None) -> Path:
+    """Write the report of one bag, or of several side by side.
+
+    :param bags: one to eight bags.
+    :param out: the HTML file; an older one is replaced.
+    :param progress: called with each bag before it is read.
+    :raises ConfigError: for unusable bags, too many of them, or an unusable output path.
+    :raises BagError: if the file cannot be written.
+    """
+    if not 1 <= len(bags) <= MAX_RUNS:
+        raise ConfigError("bags", len(bags), f"1 to {MAX_RUNS} side by side")
+    target = Path(out)
+    if target.is_dir():
+        raise ConfigError("out", str(out), "the name of a file; this is a directory")
+    runs = []
+    for bag in bags:
+        if progress:
+            progress(str(bag))
+        runs.append(run_data(bag))
+    _number_equal_names(runs)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_page(target, render(runs))
+    except OSError as error:
+        raise BagError(f"cannot write {target}: {error.strerror or error}") from error
+    return target
+
+
+def _number_equal_names(runs: list[dict[str, Any]]) -> None:
+    names = [run["name"] for run in runs]
+    for index, run in enumerate(runs):
+        if names.count(run["name"]) > 1:
+            run["name"] = f"{names[index]} ({names[: index + 1].count(names[index])})"

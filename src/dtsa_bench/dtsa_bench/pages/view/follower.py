@@ -15,7 +15,7 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import split_frames, unpack_received
 from dtsa_bench.runs.config import RunConfig
-from dtsa_bench.runs.hearing import Hearing, Unheard
+from dtsa_bench.runs.delivery import DeliveryCounts, OncePerFault
 from dtsa_bench.runs.metrics import metrics_tables
 
 from .history import MAX_BELIEVERS, MomentBuilder, RunHistory, run_info
@@ -55,7 +55,7 @@ class Follower:
         run = RunConfig.from_dict(dict(settings) if "swarm" in settings else {"swarm": dict(settings)})
         self._run, self.scenario, self.agents = run, make_scenario(run.swarm), run.swarm.agents
         self._tables = self._make_tables(run)
-        self._hearing, self._unheard = Hearing(self.agents), Unheard(run.swarm.slot_ns)
+        self._hearing, self._delivery_fault = DeliveryCounts(self.agents), OncePerFault(run.swarm.slot_ns)
         self._slot_ns = run.swarm.slot_ns
         self._period = max(1, round(_PERIOD_NS / self._slot_ns))  # slots from one moment to the next
         self._builder = MomentBuilder(self.scenario, run.air)
@@ -147,10 +147,10 @@ class Follower:
             # A frame that no agent received is not delivered, and none that a listener has missed.
             known = [row for row, sender in enumerate(senders) if sender in frames or not mask[row].any()]
             if known or not senders:
-                self._hearing.slot(len(known), mask[known])
+                self._hearing.add_slot(len(known), mask[known])
             for row, sender in enumerate(senders):
                 if sender in frames and mask[row].any() and self._tables.hear(slot, frames[sender], mask[row]):
-                    self._hearing.take_in(mask[row])
+                    self._hearing.add_accepted(mask[row])
             self._tables.end(slot)
         self._builder.add_frames(slot, int(message.outcome), senders, self._reason, mask.astype(bool))
         present = np.ones(self.agents, bool)
@@ -164,7 +164,7 @@ class Follower:
                 self._tables.estimate_position[:] = self._position
             else:
                 self._tables.estimate(slot)
-        if problem := self._unheard.news(slot, self._hearing.problem()):
+        if problem := self._delivery_fault.fault_to_report(slot, self._hearing.problem()):
             self._builder.add_event(slot, "bad", problem)
         more: dict[str, Any] = {"lag_ms": round(self._lag_ms, 2)}
         self._history.append(self._builder.build(slot, self._tables, self._chosen, self._digest, self._absent, **more))

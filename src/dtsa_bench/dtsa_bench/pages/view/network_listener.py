@@ -25,8 +25,8 @@ from dtsa_agent.core.station import (
     check_joinable,
 )
 from dtsa_agent.keys import authenticator
-from dtsa_bench.log.merge.joined import all_known_after
-from dtsa_bench.log.rules import Judge
+from dtsa_bench.log.merged_flight import slots_until_all_known
+from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.pages.html import pack
 from dtsa_bench.runs.config import REALTIME, RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS
@@ -57,12 +57,12 @@ class ListenedRun:
         self._scenario = make_scenario(config)
         self._tables = make_swarm(config, self._scenario, local=[], observers=[0])
         self._builder = MomentBuilder(self._scenario)
-        self._judge = Judge(config)
+        self._rules = RuleChecker(config)
         self._frames: dict[int, dict[int, tuple[bytes, bytes]]] = {}  # by slot, sender: with and without its tag
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
         self._absent = set(range(1, config.agents + 1))
         self._lost: dict[int, int] = {}  # slot since when, of agents that were heard before
-        self._quiet = all_known_after(config)  # slots, in which every agent has had a turn
+        self._quiet = slots_until_all_known(config)  # slots, in which every agent has had a turn
         self._late_ns: deque[int] = deque(maxlen=_LATENESS)
         self._period = max(1, round(_PERIOD_NS / config.slot_ns))  # slots from one moment to the next
         self._no_choice = np.zeros(config.agents, np.uint16)  # only the agents know whom they choose
@@ -129,8 +129,8 @@ class ListenedRun:
         self._tables.end(slot)
         if senders:
             self._builder.add_frames(slot, COLLISION if len(senders) > 1 else SUCCESS, senders, self._no_reason, None)
-            self._judge.slot(slot, {sender: frames[sender][0] for sender in senders})
-            broken, self._judge.broken = self._judge.broken, []
+            self._rules.check_slot(slot, {sender: frames[sender][0] for sender in senders})
+            broken, self._rules.broken = self._rules.broken, []
             for text in broken:
                 self._builder.add_event(slot, "bad", text)
         for sender in senders:

@@ -30,9 +30,9 @@ class EventTdma:
     def choose(self, table: Table, slot: int) -> int:
         """The owner; who is the owner and has nothing to say, nobody."""
         owner = slot % self._agents + 1
-        return owner if owner != self._agent or self._has_something_to_say(table, slot) else 0
+        return owner if owner != self._agent or self._must_send(table, slot) else 0
 
-    def _has_something_to_say(self, table: Table, slot: int) -> bool:
+    def _must_send(self, table: Table, slot: int) -> bool:
         own = self._agent - 1
         sent = int(table.sent_slot[own])
         if sent < 0 or slot - sent >= self._silence:

@@ -15,7 +15,7 @@ GUARD_US = 31.0
 HEADER = 8
 
 
-class Decoder:
+class FrameSolver:
     """Solves for the frames of one round: rows of bits that say which frames a combination is the sum of, modulo 2."""
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class Mixer:
         self._random = np.random.default_rng([config.seed, 18040, agent])
         self._due_ns = 0  # when there is something to do: a round begins or ends, or it owns a slot
         self._round = -1  # that it takes part in
-        self._heard = Decoder()
+        self._heard = FrameSolver()
         self._said = self._news = False  # in this round: a packet sent; something heard and not taken in yet
 
     def wake(self, table: Table, now_ns: int, radio: PacketRadio) -> int:
@@ -119,7 +119,7 @@ class Mixer:
     def _act(self, radio: PacketRadio) -> None:
         number, since_ns = divmod(self._due_ns, self.period_ns)
         if since_ns == 0:
-            self._round, self._said, self._news, self._heard = number, False, False, Decoder()
+            self._round, self._said, self._news, self._heard = number, False, False, FrameSolver()
             self._heard.add(1 << (self._agent - 1), int.from_bytes(radio.frame(), "little"))
         slot = since_ns // self.slot_ns
         if since_ns < self.round_ns and slot % self._count == self._agent - 1:
