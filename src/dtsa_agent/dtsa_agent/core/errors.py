@@ -37,7 +37,8 @@ class ConfigError(DtsaError, ValueError):
     """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
-        wrong = field.rpartition(".")[2] if allowed.startswith(UNKNOWN) else str(value)[:_LONGEST]
+        given = value[:_LONGEST] if isinstance(value, str) else ""
+        wrong = field.rpartition(".")[2] if allowed.startswith(UNKNOWN) else given
         listed = re.split(r"\s*[,;]\s*|\s+or\s+", allowed.removeprefix(UNKNOWN))
         near = did_you_mean(wrong, [word for word in listed if re.fullmatch(r"[A-Za-z][\w.-]*", word)])
         super().__init__(f"{field}: got {shown(value)}; allowed: {allowed}{near}")
