@@ -48,8 +48,8 @@ typedef struct dtsa_station_settings {
     double position_step;         /* m */
     int64_t slot_ns;
     uint64_t seed;
-    int sends; /* DTSA_SENDS_..: after which time without a frame an agent counts as silent */
-    int quorum;          /* others to hear and be heard by: a number, or DTSA_QUORUM_.. */
+    int sends;  /* DTSA_SENDS_..: after which time without a frame an agent counts as silent */
+    int quorum; /* others to hear and be heard by: a number, or DTSA_QUORUM_.. */
     double quorum_share; /* of the others, 0 to 1 */
     const uint8_t *key;  /* NULL: frames carry no tag */
     int key_length;
