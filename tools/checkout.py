@@ -268,7 +268,7 @@ def check_system() -> None:
         ("a C++ compiler", "g++", shutil.which(compilers[1])),
         ("Python's headers", f"python{VERSION}-dev", Path(sysconfig.get_path("include"), "Python.h").exists()),
     )
-    if missing := [(name, package) for name, package, found in needs if not found]:
+    if missing := [(name, package) for name, package, is_there in needs if not is_there]:
         names, packages = zip(*missing, strict=True)
         raise SetupError(f"missing: {', '.join(names)}; on Debian and Ubuntu: sudo apt install {' '.join(packages)}")
     if VENV.exists() and not (VENV / "dtsa.json").exists():
@@ -341,7 +341,7 @@ def lock() -> Iterator[None]:
 
 def run(name: str, title: str, *commands: Sequence[str | Path], environment: Mapping[str, str] | None = None) -> None:
     """Run the commands of a step: says what it does and for how long; their output goes into a log."""
-    path, begun = LOGS / f"{name}.log", time.monotonic()
+    path, began = LOGS / f"{name}.log", time.monotonic()
 
     def show(text: str = "") -> None:
         line = f"dtsa: {title} ... {text}"[: shutil.get_terminal_size().columns - 1]
@@ -362,7 +362,7 @@ def run(name: str, title: str, *commands: Sequence[str | Path], environment: Map
                     with suppress(subprocess.TimeoutExpired):
                         process.wait(10.0)
                         break
-                    show(f"{time.monotonic() - begun:.0f} s: {lines()[-1]}")
+                    show(f"{time.monotonic() - began:.0f} s: {lines()[-1]}")
             finally:
                 if process.poll() is None:
                     os.killpg(process.pid, signal.SIGTERM)
@@ -371,4 +371,4 @@ def run(name: str, title: str, *commands: Sequence[str | Path], environment: Map
                 show("failed")
                 reason = next(filter(ERROR.search, lines()), lines()[-1]).strip()[:300]
                 raise SetupError(f"step '{name}' failed: {reason}; log: {path}", code=1)
-    show(f"{time.monotonic() - begun:.0f} s")
+    show(f"{time.monotonic() - began:.0f} s")

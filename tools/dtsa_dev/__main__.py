@@ -2,7 +2,7 @@
 
 import sys
 
-from dtsa_bench.entry import dtsa
+from dtsa_bench.__main__ import dtsa
 
 from .registry import add_commands
 

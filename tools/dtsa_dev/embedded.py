@@ -14,16 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_dev.proofs.library import HERE, LIBRARY, compile_program, sources, tool
+from dtsa_bench.commands.registry import Command
+from dtsa_dev.proofs.programs import HERE, LIBRARY, compile_program, sources, tool
 
-DESCRIPTION = """\
-Compiles libdtsa for a Cortex-M4F, flies 200 slots of tdma, dtsa and lease with 12 and 18 agents and loss on it (in
-QEMU) and on this machine, compares every bit, and prints what memory, stack, code and calls cost. With --board the app
-of docs/how-to/on-board.md runs there instead, with 12 and 20 agents: what a slot costs it."""
-EXAMPLES = (
-    ("", "needs a cross compiler and QEMU, see docs/evidence/speed.md"),
-    ("--board", "what a slot costs the app of Crazyflies"),
-)
 CALLS = ("slot", "command", "hear", "end")  # in the order of meter.h
 TURNS = ("hear", "decide", "send", "steer", "slot", "awake")  # of the app, in the order of board_cost.c
 #: Flags for the processor of a Crazyflie.
@@ -50,7 +43,7 @@ class EmbeddedFlight:
 
 
 @dataclass(frozen=True, slots=True)
-class BoardCost:
+class BoardCosts:
     """What one policy costs the app; instructions by kind of turn: mean, most."""
 
     policy: str
@@ -61,25 +54,33 @@ class BoardCost:
     datagram: int  # bytes
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    parser.add_argument("--board", action="store_true", help="the app of Crazyflies, instead of libdtsa alone")
-    parser.add_argument("--out", metavar="FILE", help="write the table as JSON, as docs/evidence/embedded.json")
+class EmbeddedCommand(Command):
+    description = """\
+Compiles libdtsa for a Cortex-M4F, flies 200 slots of tdma, dtsa and lease with 12 and 18 agents and loss on it (in
+QEMU) and on this machine, compares every bit, and prints what memory, stack, code and calls cost. With --board the app
+of docs/how-to/on-board.md runs there instead, with 12 and 20 agents: what a slot costs it."""
+    examples = (
+        ("", "needs a cross compiler and QEMU, see docs/evidence/speed.md"),
+        ("--board", "what a slot costs the app of Crazyflies"),
+    )
 
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--board", action="store_true", help="the app of Crazyflies, instead of libdtsa alone")
+        parser.add_argument("--out", metavar="FILE", help="write the table as JSON, as docs/evidence/embedded.json")
 
-def run(args: argparse.Namespace) -> int:
-    """Fly and compare."""
-    import tempfile
+    def run(self, args: argparse.Namespace) -> int:
+        """Fly and compare."""
+        import tempfile
 
-    from dtsa_dev.documents import table
-    from dtsa_dev.records import write_record
+        from dtsa_dev.documents import table
+        from dtsa_dev.records import write_record
 
-    with tempfile.TemporaryDirectory() as place:
-        heads, rows, sizes = _measure_board(Path(place)) if args.board else _measure_library(Path(place))
-    print(f"{table(heads, rows)}\n{sizes}")
-    if args.out:
-        write_record(Path(args.out), f"embedded{' --board' * args.board} --out FILE", heads, rows, {"sizes": sizes})
-    return int(any("NOT" in cell for row in rows for cell in row))
+        with tempfile.TemporaryDirectory() as place:
+            heads, rows, sizes = _measure_board(Path(place)) if args.board else _measure_library(Path(place))
+        print(f"{table(heads, rows)}\n{sizes}")
+        if args.out:
+            write_record(Path(args.out), f"embedded{' --board' * args.board} --out FILE", heads, rows, {"sizes": sizes})
+        return int(any("NOT" in cell for row in rows for cell in row))
 
 
 def _measure_library(directory: Path) -> tuple[list[str], list[list[str]], str]:
@@ -150,7 +151,7 @@ def fly_on_cortex(
     return _read_flights(_run_on_cortex(directory, [HERE / "flight.c", *sources()], flags, metered))
 
 
-def fly_app_on_cortex(directory: Path, slots: int = 200, sample: bool = False) -> list[BoardCost]:
+def fly_app_on_cortex(directory: Path, slots: int = 200, sample: bool = False) -> list[BoardCosts]:
     """The app's loop there, with 12 agents and with as many as it is made for.
 
     :param slots: of each flight, from when the app steers.
@@ -170,7 +171,7 @@ def fly_app_on_cortex(directory: Path, slots: int = 200, sample: bool = False) -
         policy, *words = line.split()
         agents, counted, stack, *values = map(int, words)
         pairs = {kind: (values[2 * i], values[2 * i + 1]) for i, kind in enumerate(TURNS)}
-        costs.append(BoardCost(policy, agents, counted, stack + frame, pairs, values[-1]))
+        costs.append(BoardCosts(policy, agents, counted, stack + frame, pairs, values[-1]))
     return costs
 
 

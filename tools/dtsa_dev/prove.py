@@ -10,12 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_dev.proofs.library import HERE, LIBRARY, compile_program, sources, tool
+from dtsa_bench.commands.registry import Command
+from dtsa_dev.proofs.programs import HERE, LIBRARY, compile_program, sources, tool
 
-DESCRIPTION = """\
-Runs libdtsa's own code for policy lease through the states that two or three agents can reach, for all patterns of
-loss, and checks the protocol's invariants in each; then breaks one rule at a time and sees that the search finds it."""
-EXAMPLES = (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only"))
 _SPEED = "-O2"
 ANY = -1  # any number of times
 # Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody, also when it is
@@ -33,7 +30,7 @@ _DECLARED = (
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class Scope:
     """What happens in an exploration; M and S are small, because they only set time scales."""
 
     name: str
@@ -60,7 +57,7 @@ class World:
 class Explored:
     """What an exploration found."""
 
-    world: World
+    world: Scope
     broken: str  # the rule; empty: all hold in all states that were reached
     states: int
     depth: int  # slots from the start
@@ -70,21 +67,21 @@ class Explored:
 _ONCE = {"restarts": 1, "deaths": 1, "returns": 1}
 _NEVER = {"restarts": 0, "deaths": 0, "returns": 0, "claims": 0}
 WORLDS = (
-    World("two agents", 2),
-    World("two agents, OPEN turns", 2, open_every=3),
-    World("two agents, adoption", 2, adoption=True),
-    World("two agents, OPEN turns, adoption", 2, open_every=3, adoption=True),
-    World("two agents, OPEN turns, adoption, K = 2", 2, anchor_rest=2, open_every=3, adoption=True, **_ONCE, claims=2),
-    World("three agents", 3),
-    World("three agents, M = 3", 3, anchor_every=3),
-    World("three agents, adoption", 3, adoption=True),
-    World("three agents, OPEN turns", 3, open_every=4),
-    World("three agents, OPEN turns, adoption; each befalls once", 3, open_every=4, adoption=True, **_ONCE, claims=1),
-    World(
+    Scope("two agents", 2),
+    Scope("two agents, OPEN turns", 2, open_every=3),
+    Scope("two agents, adoption", 2, adoption=True),
+    Scope("two agents, OPEN turns, adoption", 2, open_every=3, adoption=True),
+    Scope("two agents, OPEN turns, adoption, K = 2", 2, anchor_rest=2, open_every=3, adoption=True, **_ONCE, claims=2),
+    Scope("three agents", 3),
+    Scope("three agents, M = 3", 3, anchor_every=3),
+    Scope("three agents, adoption", 3, adoption=True),
+    Scope("three agents, OPEN turns", 3, open_every=4),
+    Scope("three agents, OPEN turns, adoption; each befalls once", 3, open_every=4, adoption=True, **_ONCE, claims=1),
+    Scope(
         "three agents, OPEN turns, adoption, handed on far ahead", 3, open_every=4, adoption=True, restarts=1, deaths=0,
         returns=0, claims=1, relay_reach=1,
     ),
-    World(
+    Scope(
         "four agents, OPEN turns, adoption: chains of hand-ons; bounded", 4, open_every=5, adoption=True, **_NEVER,
         most_states=1_000_000,
     ),
@@ -99,14 +96,14 @@ class Mutant:
     file: str  # below policy/lease
     right: str
     wrong: str
-    world: World
+    world: Scope
 
 
-_PLAIN, _RESTART = World("plain", 2, restarts=0, deaths=0), World("restart", 2, restarts=1, deaths=0)
-_RESTS = World("rests", 2, anchor_rest=2, open_every=1, adoption=True, restarts=1, deaths=0)
-_OPEN, _ADOPTS = World("open", 2, open_every=3, deaths=0), World("adopts", 2, adoption=True)
-_HANDS = World("hands on", 3, open_every=4, adoption=True, **_NEVER)
-_RELAYS = World("relays", 3, anchor_every=3, open_every=4, adoption=True, **_NEVER, most_states=10**6)
+_PLAIN, _RESTART = Scope("plain", 2, restarts=0, deaths=0), Scope("restart", 2, restarts=1, deaths=0)
+_RESTS = Scope("rests", 2, anchor_rest=2, open_every=1, adoption=True, restarts=1, deaths=0)
+_OPEN, _ADOPTS = Scope("open", 2, open_every=3, deaths=0), Scope("adopts", 2, adoption=True)
+_HANDS = Scope("hands on", 3, open_every=4, adoption=True, **_NEVER)
+_RELAYS = Scope("relays", 3, anchor_every=3, open_every=4, adoption=True, **_NEVER, most_states=10**6)
 MUTANTS = (
     Mutant(
         "an agent that comes later begins in probation", "lease.c",
@@ -150,7 +147,7 @@ MUTANTS = (
     ),
     Mutant(
         "no adoption where it is switched off", "issue.c",
-        "agent->table->config->lease.adoption && !v.a->probation", "!v.a->probation", World("dies", 2),
+        "agent->table->config->lease.adoption && !v.a->probation", "!v.a->probation", Scope("dies", 2),
     ),
     Mutant(
         "an owner does not change what its lessee has handed on", "lease.c", "!from_me && issuer", "issuer", _RELAYS,
@@ -158,27 +155,31 @@ MUTANTS = (
 )  # fmt: skip
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    parser.add_argument("--mutants", action="store_true", help="the broken rules only")
+class ProveCommand(Command):
+    description = """\
+Runs libdtsa's own code for policy lease through the states that two or three agents can reach, for all patterns of
+loss, and checks the protocol's invariants in each; then breaks one rule at a time and sees that the search finds it."""
+    examples = (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only"))
 
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--mutants", action="store_true", help="the broken rules only")
 
-def run(args: argparse.Namespace) -> int:
-    """Explore."""
-    import tempfile
+    def run(self, args: argparse.Namespace) -> int:
+        """Explore."""
+        import tempfile
 
-    failed = 0
-    with tempfile.TemporaryDirectory() as directory:
-        for world in () if args.mutants else WORLDS:
-            found = explore(build(Path(directory), relay_reach=world.relay_reach), world)
-            failed += bool(found.broken)
-            end = found.broken or ("all states" if found.closed else "holds so far, not all states")
-            print(f"{world.name:62} {found.states:9} states, depth {found.depth:3}: {end}", flush=True)
-        for mutant in MUTANTS:
-            found = explore(build(Path(directory), mutant), mutant.world)
-            failed += not found.broken
-            print(f"without {mutant.rule!r}: {found.broken or 'NOT FOUND'}; {found.states} states", flush=True)
-    return 1 if failed else 0
+        failed = 0
+        with tempfile.TemporaryDirectory() as directory:
+            for world in () if args.mutants else WORLDS:
+                result = explore(build(Path(directory), relay_reach=world.relay_reach), world)
+                failed += bool(result.broken)
+                end = result.broken or ("all states" if result.closed else "holds so far, not all states")
+                print(f"{world.name:62} {result.states:9} states, depth {result.depth:3}: {end}", flush=True)
+            for mutant in MUTANTS:
+                result = explore(build(Path(directory), mutant), mutant.world)
+                failed += not result.broken
+                print(f"without {mutant.rule!r}: {result.broken or 'NOT FOUND'}; {result.states} states", flush=True)
+        return 1 if failed else 0
 
 
 def build(directory: Path, mutant: Mutant | None = None, relay_reach: int = 24) -> Path:
@@ -215,11 +216,11 @@ def _replace(path: Path, right: str, wrong: str) -> None:
     path.write_text(text.replace(right, wrong), encoding="utf-8")
 
 
-def explore(program: Path, world: World, limit_s: float = 3600.0) -> Explored:
+def explore(program: Path, world: Scope, limit_s: float = 3600.0) -> Explored:
     """Explore a world, within a limit of wall-clock time."""
     command = [str(program), *world.words()]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit_s)
-    found = re.search(r"(?:broken (.*); )?states (\d+) depth (\d+)(.*)", done.stdout)
-    if found is None:
+    match = re.search(r"(?:broken (.*); )?states (\d+) depth (\d+)(.*)", done.stdout)
+    if match is None:
         raise DtsaError(f"prove: exit code {done.returncode}: {(done.stdout + done.stderr).strip()[-300:]}")
-    return Explored(world, found[1] or "", int(found[2]), int(found[3]), "closed" in found[4])
+    return Explored(world, match[1] or "", int(match[2]), int(match[3]), "closed" in match[4])

@@ -14,15 +14,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.commands.registry import Command
 
-DESCRIPTION = """\
-Makes the source distribution and the wheels (x86_64 and aarch64) of this checkout, installs them in fresh environments
-of Python 3.10 to 3.13 (aarch64: Debian's Python in QEMU), tries commands there, and compares digests of flights. The
-files, release.json and release.log are then in DIR. Nothing is uploaded."""
-EXAMPLES = (
-    ("--out dist", "everything"),
-    ("--out dist --skip 3.12 --skip aarch64", "on a machine without that Python and without a cross compiler"),
-)
 ROOT = Path(__file__).resolve().parents[2]
 TRIAL = Path(__file__).with_name("release_trial.py")
 PYTHONS, AARCH64 = ("3.10", "3.11", "3.12", "3.13"), "aarch64"
@@ -34,42 +27,50 @@ FOREIGN = ("AMENT_", "ROS_", "RMW_", "DTSA_", "LD_LIBRARY_PATH", "VIRTUAL_ENV", 
 CLEAN = {name: value for name, value in os.environ.items() if not name.startswith(FOREIGN)} | {"CFLAGS": "-g0"}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    parser.add_argument("--out", metavar="DIR", required=True, help="new directory for the files")
-    text = f"do without, where the machine lacks it: {', '.join((*PYTHONS, AARCH64))}; more than once"
-    parser.add_argument("--skip", metavar="NAME", action="append", default=[], help=text)
+class ReleaseCommand(Command):
+    description = """\
+Makes the source distribution and the wheels (x86_64 and aarch64) of this checkout, installs them in fresh environments
+of Python 3.10 to 3.13 (aarch64: Debian's Python in QEMU), tries commands there, and compares digests of flights. The
+files, release.json and release.log are then in DIR. Nothing is uploaded."""
+    examples = (
+        ("--out dist", "everything"),
+        ("--out dist --skip 3.12 --skip aarch64", "on a machine without that Python and without a cross compiler"),
+    )
 
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--out", metavar="DIR", required=True, help="new directory for the files")
+        text = f"do without, where the machine lacks it: {', '.join((*PYTHONS, AARCH64))}; more than once"
+        parser.add_argument("--skip", metavar="NAME", action="append", default=[], help=text)
 
-def run(args: argparse.Namespace) -> int:
-    """Make and try everything.
+    def run(self, args: argparse.Namespace) -> int:
+        """Make and try everything.
 
-    :returns: exit code: 0, or 1 if something is not as it should be.
-    :raises ConfigError: for what the machine lacks.
-    """
-    from dtsa_bench.runs.options import new_directory
+        :returns: exit code: 0, or 1 if something is not as it should be.
+        :raises ConfigError: for what the machine lacks.
+        """
+        from dtsa_bench.runs.options import new_directory
 
-    wanted = [name for name in (*PYTHONS, AARCH64) if name not in args.skip]
-    lacking = [
-        name
-        for name in wanted
-        if not (all(map(shutil.which, (CROSS["CC"], QEMU))) if name == AARCH64 else python(name))
-    ]
-    if lacking:
-        raise ConfigError(
-            "machine", f"without {', '.join(lacking)}", f"one with all, or --skip {' --skip '.join(lacking)}"
-        )
-    out = new_directory(args.out)
-    with tempfile.TemporaryDirectory(prefix="dtsa-release-") as name, (out / "release.log").open("w") as log:
-        try:
-            record = Release(out, Path(name), log).make(wanted)
-        except subprocess.CalledProcessError as error:
-            print(f"dtsa: error: failed: {' '.join(error.cmd)[:200]}; log: {out / 'release.log'}", file=sys.stderr)
-            return 1
-    text = json.dumps(record, indent=1) + "\n"
-    (out / "release.json").write_text(text, encoding="utf-8")
-    print(text, end="")
-    return 0 if record["ok"] else 1
+        wanted = [name for name in (*PYTHONS, AARCH64) if name not in args.skip]
+        lacking = [
+            name
+            for name in wanted
+            if not (all(map(shutil.which, (CROSS["CC"], QEMU))) if name == AARCH64 else python(name))
+        ]
+        if lacking:
+            raise ConfigError(
+                "machine", f"without {', '.join(lacking)}", f"one with all, or --skip {' --skip '.join(lacking)}"
+            )
+        out = new_directory(args.out)
+        with tempfile.TemporaryDirectory(prefix="dtsa-release-") as name, (out / "release.log").open("w") as log:
+            try:
+                record = Release(out, Path(name), log).make(wanted)
+            except subprocess.CalledProcessError as error:
+                print(f"dtsa: error: failed: {' '.join(error.cmd)[:200]}; log: {out / 'release.log'}", file=sys.stderr)
+                return 1
+        text = json.dumps(record, indent=1) + "\n"
+        (out / "release.json").write_text(text, encoding="utf-8")
+        print(text, end="")
+        return 0 if record["ok"] else 1
 
 
 def python(version: str) -> str:
@@ -81,7 +82,7 @@ def python(version: str) -> str:
 
 
 class Release:
-    """Makes and tries the files of a release.
+    """Make and try the files of a release.
 
     :param out: folder for the files.
     :param work: folder for all else.

@@ -57,7 +57,7 @@ if __name__ == "__main__":
     Path("sweep.yaml").write_text(SWEEP, encoding="utf-8")
     failures = [] if len(dtsa.simulate(agents=4, timeout_s=3).slots) else ["no table of slots"]
     for words, code, text, path in COMMANDS:
-        got, said = run(words)
-        if got != code or text not in said or not Path(path).exists():
-            failures.append(f"dtsa {words}: exit code {got}: {' '.join(said.split())[-200:]}")
+        exit_code, output = run(words)
+        if exit_code != code or text not in output or not Path(path).exists():
+            failures.append(f"dtsa {words}: exit code {exit_code}: {' '.join(output.split())[-200:]}")
     print(json.dumps({"version": dtsa.__version__, "failures": failures, "digest": digest()}))

@@ -67,8 +67,8 @@ def definition(name: str) -> Path:
     """File of an interface, `package/msg/Name`."""
     from ament_index_python.packages import get_package_prefix
 
-    package, _, rest = name.partition("/")
-    return Path(get_package_prefix(package), "share", package, f"{rest}.{rest.partition('/')[0]}")
+    package, _, name_in_package = name.partition("/")
+    return Path(get_package_prefix(package), "share", package, f"{name_in_package}.{name_in_package.partition('/')[0]}")
 
 
 def class_of(name: str) -> Any:

@@ -47,7 +47,7 @@ class _Backend(_BuildMetaBackend):  # type: ignore[misc, unused-ignore]
             package_dir=folders,
             package_data=data,
             ext_modules=extensions,
-            entry_points={**points, "console_scripts": ["dtsa = dtsa_bench.entry:dtsa"]},
+            entry_points={**points, "console_scripts": ["dtsa = dtsa_bench.__main__:dtsa"]},
             options={"build": {"build_base": build}, "bdist_wheel": {"py_limited_api": "cp310"}},
             zip_safe=False,
         )

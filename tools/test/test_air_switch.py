@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dtsa_dev.network.hosts import Host, hosts, why_not
+from dtsa_dev.network.hosts import EmulatedHost, hosts, why_not
 from dtsa_dev.network.switch import Intruder, Links, Switch
 from trials import Trial, TrialError, flight_time, under_way
 
@@ -52,7 +52,7 @@ class Cables:
         self.pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(3)]
         for end in (end for pair in self.pairs for end in pair):
             end.setblocking(False)
-        joined = [Host(k + 1, "", pair[0].fileno(), -1) for k, pair in enumerate(self.pairs)]
+        joined = [EmulatedHost(k + 1, "", pair[0].fileno(), -1) for k, pair in enumerate(self.pairs)]
         self.switch = Switch(joined, GROUP, ChannelConfig(agents=3, link_delay_ns=0, **channel), links)
 
     def send(self, host: int, data: bytes) -> None:
@@ -152,7 +152,7 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
     assert is_verified(found), found["decisions_again"]
     assert found["slots_with_two_senders"] == 0
     assert found["flight"] is not None
-    assert stranger.said > 10
+    assert stranger.sent_count > 10
     refused = {reason for counts in found["not_taken_in"].values() for reason in counts}
     assert {"other time", "repeated", "rejected"} <= refused
     whole = tmp_path / "whole"

@@ -131,7 +131,7 @@ def test_the_environment_of_others_is_left_alone_and_another_python_has_its_own(
 
 def test_what_is_made_again_when_a_file_changes(empty: Path) -> None:
     before, messages = checkout.keys()
-    (empty / "src/dtsa_bench/dtsa_bench/entry.py").write_text("# Python takes effect at once")
+    (empty / "src/dtsa_bench/dtsa_bench/__main__.py").write_text("# Python takes effect at once")
     with (empty / "pyproject.toml").open("a") as file:
         file.write("# a linter's settings\n")
     assert checkout.keys() == (before, messages)

@@ -15,6 +15,7 @@ import pytest
 
 pytest.importorskip("mkdocs")
 
+from browser_helpers import CHROMIUM, MISSING, browsing
 from dtsa_dev.registry import main
 
 from dtsa_agent.core.settings.config import SwarmConfig
@@ -57,6 +58,19 @@ def test_a_page_is_found_in_two_clicks_and_needs_no_network(site: Path) -> None:
         assert 'class="mermaid"' not in text, path.relative_to(site)
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+def test_a_page_that_is_opened_from_the_disk_is_searched(site: Path) -> None:
+    with browsing() as browser:
+        browser.open((site / "how-to" / "fly.html").as_uri())
+        field = "document.querySelector('input[name=query]')"
+        browser.wait_for(field)
+        browser.run(f"{field}.focus(), {field}.value = 'genie', {field}.dispatchEvent(new KeyboardEvent('keyup'))")
+        browser.wait_for(
+            "[...document.querySelectorAll('.md-search-result__item')].some(x => /genie/i.test(x.innerText))"
+        )
+        assert not browser.complaints()
+
+
 def test_pages_and_tables_are_made_from_the_code(site: Path) -> None:
     rows = json.loads((site / "search" / "search_index.json").read_text(encoding="utf-8"))["docs"]
     found = {row["location"]: row["text"] for row in rows}
@@ -67,6 +81,12 @@ def test_pages_and_tables_are_made_from_the_code(site: Path) -> None:
     assert all(f"<code>{spec.name}</code>" in settings for spec in settings_of(SwarmConfig))
     assert "<code>/swarm/slot</code>" in (site / "reference" / "nodes.html").read_text(encoding="utf-8")
     assert not [path.name for path in pages(site) if "<!-- table:" in path.read_text(encoding="utf-8")]
+
+
+def test_types_of_settings_are_those_of_the_settings() -> None:
+    from dtsa_dev.documents.pages import run_settings
+
+    assert (ROOT / "src" / "dtsa_bench" / "dtsa" / "_settings.py").read_text(encoding="utf-8") == run_settings()
 
 
 def test_dead_links_and_pages_that_nobody_finds_end_the_build(tmp_path: Path) -> None:

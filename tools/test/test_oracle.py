@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from dtsa_dev.proofs.both_statements import Differs, Setting, fly_both, random_setting
+from dtsa_dev.proofs.both_statements import CheckedFlight, Differs, fly_both, random_setting
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.reference.lease import issue, listen
@@ -28,7 +28,7 @@ def test_flights_are_equal_in_which_the_dead_are_adopted_and_some_come_back(seed
 @pytest.mark.parametrize("moving", [2, 3])
 def test_flights_are_equal_in_which_few_of_many_move(moving: int) -> None:
     swarm = SwarmConfig(agents=12, moving=moving, policy="lease", avoider="none", axis_x_m=20.0, seed=3)
-    figures = fly_both(Setting(swarm, ChannelConfig(agents=12, seed=3), 300))
+    figures = fly_both(CheckedFlight(swarm, ChannelConfig(agents=12, seed=3), 300))
     assert {"own", "anchor", "leased", "open"} <= set(figures["reasons"])
 
 

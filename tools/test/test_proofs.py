@@ -17,9 +17,8 @@ from dtsa_dev.embedded import (
     fly_on_cortex,
     fused,
 )
-from dtsa_dev.proofs.fuzz import Found, build, fuzz
-from dtsa_dev.proofs.library import LIBRARY, NotHere
-from dtsa_dev.prove import MUTANTS, World, explore
+from dtsa_dev.proofs.programs import LIBRARY, FuzzFinding, NotHere, build, fuzz
+from dtsa_dev.prove import MUTANTS, Scope, explore
 from dtsa_dev.prove import build as build_prover
 
 
@@ -51,7 +50,7 @@ def test_fuzzing_finds_a_missing_check(tmp_path: Path) -> None:
     )
     with skipped_if_not_here():
         program = build("frames", tmp_path, broken)
-    with pytest.raises(Found, match=r"overflow|out of bounds|ABRT|deadly"):
+    with pytest.raises(FuzzFinding, match=r"overflow|out of bounds|ABRT|deadly"):
         fuzz(program, 20, tmp_path / "corpus", seed=1)
 
 
@@ -103,7 +102,7 @@ def test_code_for_software_doubles_gives_the_same_bits(tmp_path: Path) -> None:
 def test_every_state_of_three_agents_keeps_the_rules(adoption: bool, tmp_path: Path) -> None:
     """Through a restart, a death and what it leads to, for all patterns of loss."""
     claims = 1 if adoption else 0
-    world = World("three agents", 3, adoption=adoption, restarts=1, deaths=1, returns=0, claims=claims)
+    world = Scope("three agents", 3, adoption=adoption, restarts=1, deaths=1, returns=0, claims=claims)
     whole = explore(build_prover(tmp_path), world)
     assert whole.closed
     assert not whole.broken
@@ -112,7 +111,7 @@ def test_every_state_of_three_agents_keeps_the_rules(adoption: bool, tmp_path: P
 
 def test_anchors_that_are_given_away_keep_the_rules(tmp_path: Path) -> None:
     """OPEN turns, adoption, a restart, a wrong claim; one anchor in two is a main one."""
-    world = World(
+    world = Scope(
         "two agents", 2, anchor_rest=2, open_every=3, adoption=True, restarts=1, deaths=0, returns=0, claims=1
     )
     whole = explore(build_prover(tmp_path), world)

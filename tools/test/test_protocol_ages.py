@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.protocol.experiment import Event, Experiment, Outcome
+from dtsa_dev.protocol.experiment import Experiment, FlightEvent, Outcome
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_channel_sim import ChannelConfig
@@ -37,15 +37,17 @@ def run(protocol: str, agents: int, movers: int, seed: int, slots: int, warmup: 
     return experiment.run(slots)
 
 
-def _stop_and_go(ids: list[int], pause: int, slots: int, pick: np.random.Generator) -> tuple[list[int], list[Event]]:
+def _stop_and_go(
+    ids: list[int], pause: int, slots: int, pick: np.random.Generator
+) -> tuple[list[int], list[FlightEvent]]:
     movers: list[int] = []
-    events: list[Event] = []
+    events: list[FlightEvent] = []
     for agent in ids:
         slot, flies = -int(pick.integers(0, FLYING + pause)), True
         while slot < slots:
             length = int(pick.uniform(0.6, 1.4) * (FLYING if flies else pause))
             if slot > 0:
-                events.append(Event(slot, "go" if flies else "stop", agent))
+                events.append(FlightEvent(slot, "go" if flies else "stop", agent))
             elif flies and slot + length > 0:
                 movers.append(agent)
             slot, flies = slot + length, not flies

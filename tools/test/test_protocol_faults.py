@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.protocol.experiment import Event, Experiment, random_schedule
+from dtsa_dev.protocol.experiment import Experiment, FlightEvent, random_schedule
 
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.frame import ExtendedFrame, encode_extended
@@ -21,13 +21,13 @@ NEVER = 2**62  # slot
 KINDS = ("go", "stop", "go", "stop", "die", "join", "join", "restart", "leave")
 
 
-def _events(random: np.random.Generator, agents: int, slots: int) -> list[Event]:
+def _events(random: np.random.Generator, agents: int, slots: int) -> list[FlightEvent]:
     events = []
     for agent in range(1, agents + 1):
         slot, pace = 0, (30, 200, 800, 2000)[random.integers(0, 4)]
         while slot < slots:
             slot += int(random.integers(1, pace))
-            events.append(Event(slot, KINDS[random.integers(0, len(KINDS))], agent))
+            events.append(FlightEvent(slot, KINDS[random.integers(0, len(KINDS))], agent))
     return events
 
 
@@ -151,7 +151,7 @@ def test_the_ledger_sees_broken_rules() -> None:
 
 def test_waits_are_measured() -> None:
     config = SwarmConfig(agents=12, policy="lease", avoider="none")
-    out = Experiment(config, movers=range(1, 13), absent=[5], events=[Event(1500, "join", 5)]).run(2000)
+    out = Experiment(config, movers=range(1, 13), absent=[5], events=[FlightEvent(1500, "join", 5)]).run(2000)
     (wait,) = out.waits
     assert (wait.agent, wait.kind, wait.since) == (5, "join", 1500)
     assert 0 <= wait.to_first <= wait.to_all <= 7 * 12

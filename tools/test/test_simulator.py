@@ -9,7 +9,7 @@ import sysconfig
 from pathlib import Path
 
 import pytest
-from dtsa_dev.proofs.library import LIBRARY, NotHere, compile_program, sources, tool
+from dtsa_dev.proofs.programs import LIBRARY, NotHere, compile_program, sources, tool
 
 import dtsa_agent
 

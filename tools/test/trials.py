@@ -20,7 +20,7 @@ from typing import Any
 
 import yaml
 from dtsa_dev.network.fake_modems import FakeModems, FakeModemSettings
-from dtsa_dev.network.hosts import CABLE, Host, hosts
+from dtsa_dev.network.hosts import CABLE, EmulatedHost, hosts
 from dtsa_dev.network.switch import Links, Switch
 
 from dtsa_agent.air.port import HEADER
@@ -181,7 +181,7 @@ class AgentFlight:
 
 
 class UdpFlight(AgentFlight):
-    def __init__(self, trial: Trial, joined: Sequence[Host], directory: Path) -> None:
+    def __init__(self, trial: Trial, joined: Sequence[EmulatedHost], directory: Path) -> None:
         super().__init__(trial, directory)
         self.hosts = {host.number: host for host in joined}
         swarm = trial.swarm

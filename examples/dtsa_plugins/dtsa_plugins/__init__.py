@@ -11,8 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.plugins.table import Table
-from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa import SwarmConfig, Table
 
 Array = NDArray[np.float64]
 

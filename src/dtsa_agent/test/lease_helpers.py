@@ -11,8 +11,8 @@ import pytest
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig
 from dtsa_agent.core.frame import ExtendedFrame, decode_extended, encode_extended
 from dtsa_agent.core.reference.lease.memory import Memory
-from dtsa_agent.core.reference.rules import Rules
 from dtsa_agent.core.reference.stepper import ReferenceSwarm
+from dtsa_agent.core.reference.table import Rules
 
 FAR = 1e6  # m, a goal that nobody reaches
 STATEMENTS = pytest.mark.parametrize("statement", [Swarm, ReferenceSwarm], ids=["C", "Python"])

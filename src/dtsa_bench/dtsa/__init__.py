@@ -23,8 +23,9 @@ if TYPE_CHECKING:
         RemoteProtocolError,
         SlotOutcome,
         SwarmConfig,
+        plug_in_random,
     )
-    from dtsa_agent.core.plugins.table import Table
+    from dtsa_agent.core.plugins.kinds import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
     from dtsa_bench.drawing.palette import agent_colour
     from dtsa_bench.log.bag.errors import BagError, UnusableBag
@@ -73,6 +74,7 @@ __all__ = [
     "plot_lines",
     "plot_matrix",
     "plot_trajectories",
+    "plug_in_random",
     "register",
     "run_config",
     "simulate",
@@ -86,7 +88,7 @@ _HOMES = {
     "dtsa._sweep": ("SweepResult", "sweep"),
     "dtsa_agent.core": (
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "PluginError", "RemoteProtocolError",
-        "SlotOutcome", "SwarmConfig",
+        "SlotOutcome", "SwarmConfig", "plug_in_random",
     ),
     "dtsa_agent.core.plugins.entry_points": ("Table",),
     "dtsa_agent.core.registry": ("REASONS",),

@@ -1,6 +1,7 @@
-"""Figures. Each function returns a new `matplotlib.figure.Figure`; nothing is shown or saved.
+"""Figures. Each function returns a `matplotlib.figure.Figure`; nothing is shown or saved.
 
-In a notebook a cell that ends with a figure shows it.
+In a notebook a cell that ends with a figure shows it. `ax` draws into axes of a figure of your own: one axes, or as
+many as the figure has panels.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dtsa_agent.core.errors import ConfigError
@@ -40,17 +43,31 @@ def _show_in_notebooks() -> None:
 
 _show_in_notebooks()
 
+Panels = Axes | Sequence[Axes] | None
 
-def plot_trajectories(*flights: FlightLog, titles: Sequence[str] | None = None) -> Figure:
+
+def _listed(ax: Panels) -> list[Axes] | None:
+    """Return the axes that a caller gave, in a row; None: the figure gets new ones."""
+    return None if ax is None else list(np.ravel(np.array(ax, dtype=object)))
+
+
+def plot_trajectories(*flights: FlightLog, titles: Sequence[str] | None = None, ax: Panels = None) -> Figure:
     """Paths of the movers from above: a panel a flight, rings where they start and discs where they end.
 
     :param flights: simulated or recorded flights.
     :param titles: one a flight; None: policy and estimator.
+    :param ax: axes to draw in; None: a new figure.
+
+    >>> flights = [dtsa.simulate(agents=4, policy=policy) for policy in ("tdma", "lease")]
+    >>> figure = plot_trajectories(*flights)  # figure.savefig("paths.png")
+    >>> plot_distances(*flights, ax=figure.axes[0]) is figure  # into axes of a figure that is there
+    True
+
     :raises ConfigError: without a flight, or for a number of titles that does not fit.
     """
     names = _titles(flights, titles)
     with style():
-        figure, axes = panels(len(flights), width=3.3, height=3.6)
+        figure, axes = panels(len(flights), width=3.3, height=3.6, given=_listed(ax))
         for axis, flight, name in zip(axes, flights, names, strict=True):
             paint(axis, flight.path, flight.moving, ids=False)
             axis.set_aspect("equal", "datalim")
@@ -60,16 +77,17 @@ def plot_trajectories(*flights: FlightLog, titles: Sequence[str] | None = None) 
     return figure
 
 
-def plot_distances(*flights: FlightLog, titles: Sequence[str] | None = None) -> Figure:
+def plot_distances(*flights: FlightLog, titles: Sequence[str] | None = None, ax: Panels = None) -> Figure:
     """Smallest distance between any two agents over time, m over s; the dotted line is where two have crashed.
 
     :param flights: simulated or recorded flights, a line each.
     :param titles: one a flight; None: policy and estimator.
+    :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: without a flight, or for a number of titles that does not fit.
     """
     names = _titles(flights, titles)
     with style():
-        figure, (axis,) = panels(1, width=5.6, height=3.6)
+        figure, (axis,) = panels(1, width=5.6, height=3.6, given=_listed(ax))
         for flight, name, shade in zip(flights, names, colours(list(range(len(flights)))), strict=True):
             axis.plot(flight.distances["time_s"], flight.distances["distance_m"], color=shade, label=name)
         axis.axhline(flights[0].config.limits.collision_m, color=QUIET, linewidth=1, linestyle=":")
@@ -79,16 +97,17 @@ def plot_distances(*flights: FlightLog, titles: Sequence[str] | None = None) -> 
     return figure
 
 
-def plot_ages(*flights: FlightLog, titles: Sequence[str] | None = None) -> Figure:
+def plot_ages(*flights: FlightLog, titles: Sequence[str] | None = None, ax: Panels = None) -> Figure:
     """Mean age of what the agents know of each other over time, slots over s.
 
     :param flights: simulated or recorded flights, a line each.
     :param titles: one a flight; None: policy and estimator.
+    :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: without a flight, for a number of titles that does not fit, or if pandas is missing.
     """
     names = _titles(flights, titles)
     with style():
-        figure, (axis,) = panels(1, width=5.6, height=3.6)
+        figure, (axis,) = panels(1, width=5.6, height=3.6, given=_listed(ax))
         for flight, name, shade in zip(flights, names, colours(list(range(len(flights)))), strict=True):
             mean = flight.ages.groupby("time_s")["age_slots"].mean()
             axis.plot(mean.index, mean.to_numpy(), color=shade, label=name)
@@ -98,20 +117,29 @@ def plot_ages(*flights: FlightLog, titles: Sequence[str] | None = None) -> Figur
     return figure
 
 
-def plot_bars(result: SweepResult, *, x: str, y: str | Sequence[str], series: str | None = None) -> Figure:
+def plot_bars(
+    result: SweepResult, *, x: str, y: str | Sequence[str], series: str | None = None, ax: Panels = None
+) -> Figure:
     """Grouped bars of a sweep with 95 % intervals: a panel a measure.
 
     :param result: the sweep.
     :param x: axis whose levels are the groups.
     :param y: measures: `crashed` or a measure of `SweepResult.table`.
     :param series: axis whose levels are the bars of a group.
+    :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: for an axis or a measure that does not exist.
     """
-    return _chart(result, charts.bars, y, x=x, series=series)
+    return _chart(result, charts.bars, y, ax, x=x, series=series)
 
 
 def plot_lines(
-    result: SweepResult, *, x: str, y: str | Sequence[str], series: str | None = None, facets: str | None = None
+    result: SweepResult,
+    *,
+    x: str,
+    y: str | Sequence[str],
+    series: str | None = None,
+    facets: str | None = None,
+    ax: Panels = None,
 ) -> Figure:
     """Lines over the numbers of an axis of a sweep, with 95 % intervals.
 
@@ -120,24 +148,26 @@ def plot_lines(
     :param y: measures: `crashed` or a measure of `SweepResult.table`.
     :param series: axis whose levels are the lines.
     :param facets: axis whose levels have a panel each.
+    :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: for an axis or a measure that does not exist.
     """
-    return _chart(result, charts.lines, y, x=x, series=series, facets=facets)
+    return _chart(result, charts.lines, y, ax, x=x, series=series, facets=facets)
 
 
-def plot_matrix(result: SweepResult, *, rows: str, columns: str, y: str | Sequence[str]) -> Figure:
+def plot_matrix(result: SweepResult, *, rows: str, columns: str, y: str | Sequence[str], ax: Panels = None) -> Figure:
     """A coloured table of a sweep: a panel a measure.
 
     :param result: the sweep.
     :param rows: axis whose levels are the rows.
     :param columns: axis whose levels are the columns.
     :param y: measures: `crashed` or a measure of `SweepResult.table`.
+    :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: for an axis or a measure that does not exist.
     """
-    return _chart(result, charts.matrix, y, rows=rows, columns=columns)
+    return _chart(result, charts.matrix, y, ax, rows=rows, columns=columns)
 
 
-def _chart(result: SweepResult, draw: Any, y: str | Sequence[str], **roles: str | None) -> Figure:
+def _chart(result: SweepResult, draw: Any, y: str | Sequence[str], ax: Panels, **roles: str | None) -> Figure:
     spec: dict[str, Any] = {role: axis for role, axis in roles.items() if axis is not None}
     for role, axis in spec.items():
         if axis not in result.axes:
@@ -147,7 +177,7 @@ def _chart(result: SweepResult, draw: Any, y: str | Sequence[str], **roles: str 
         if measure != CRASHED and measure not in MEASURES:
             raise ConfigError("y", measure, ", ".join((CRASHED, *MEASURES)))
     with style():
-        figure: Figure = draw(result._table, spec)
+        figure: Figure = draw(result._table, spec, _listed(ax))
     return figure
 
 

@@ -57,7 +57,7 @@ class SweepResult:
         return [*([("base", base)] if base else []), ("kept", where), ("more", more)]
 
     def write_paper(self, directory: str | Path, figures: str = "pdf") -> list[Path]:
-        """Writes figures, `table.tex` (booktabs) and `table.csv` for a paper; `table.json` says how they were made.
+        """Write figures, `table.tex` (booktabs) and `table.csv` for a paper; `table.json` says how they were made.
 
         Figures and the LaTeX table say so, too: command, seeds, date, commit, versions.
 
@@ -108,7 +108,7 @@ def sweep(
     out: str | Path | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> SweepResult:
-    """Flies every combination of some settings with every seed.
+    """Fly every combination of some settings with every seed.
 
     :param preset: a sweep that comes with the package (`dtsa sweep --list`), instead of axes.
     :param axes: name -> a list of values of the setting of that name, or names with settings each:
@@ -120,6 +120,11 @@ def sweep(
     :param out: directory for results.csv, results.json and a journal, with which an interrupted sweep goes on; None:
         nothing is written.
     :param progress: called with the number of flights done since the last call.
+
+    >>> result = sweep(axes={"loss": [0, 0.2], "policy": ["tdma", "lease"]}, base={"agents": 4}, seeds=2)
+    >>> result.table()[["loss", "policy", "runs", "crashed"]].values.tolist()
+    [[0.0, 'tdma', 2, 0.0], [0.0, 'lease', 2, 0.0], [0.2, 'tdma', 2, 0.0], [0.2, 'lease', 2, 0.0]]
+
     :raises ConfigError: for a setting that is not usable; nothing has flown then.
     :raises DtsaError: if worker processes keep dying.
     """
@@ -137,8 +142,8 @@ def sweep(
         content: dict[str, Any] = {"axes": plain, "base": dict(base or {}), "seeds": chosen}
         plan = make_sweep(content, "sweep", first_seed=first_seed)
 
-    given = {"preset": preset, "axes": axes, "base": base, "seeds": seeds, "first_seed": first_seed}
-    said = ", ".join(f"{name}={value!r}" for name, value in given.items() if value is not None)
+    arguments = {"preset": preset, "axes": axes, "base": base, "seeds": seeds, "first_seed": first_seed}
+    call = ", ".join(f"{name}={value!r}" for name, value in arguments.items() if value is not None)
     if jobs > 1 or out is not None:
         _refuse_registered(plan, "jobs" if jobs > 1 else "out", jobs if jobs > 1 else str(out))
 
@@ -153,4 +158,4 @@ def sweep(
         with closing(Journal(place, plan.batch)) as journal:
             table = SweepTable(plan, run_all(plan.batch, journal, jobs=jobs, advance=advance))
         write_results(place, table, code)
-    return SweepResult(plan.name, plan.axes, place, f"dtsa.sweep({said})", table, code)
+    return SweepResult(plan.name, plan.axes, place, f"dtsa.sweep({call})", table, code)

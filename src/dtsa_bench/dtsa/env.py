@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.environment import MeanAge, Observer, Reward, SlotResults, SwarmEnv, fields
 
-from ._flights import run_config
+from ._flights import config_of
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from ._settings import RunSettings
 
 __all__ = ["MeanAge", "Observer", "Reward", "SlotResults", "SwarmEnv", "fields", "parallel_env"]
 
@@ -19,7 +24,7 @@ def parallel_env(
     reward: Reward | None = None,
     slots: int | None = None,
     render_mode: str | None = None,
-    **settings: Any,
+    **settings: Unpack[RunSettings],
 ) -> SwarmEnv:
     """One flight as a `ParallelEnv` of PettingZoo.
 
@@ -29,11 +34,13 @@ def parallel_env(
     :param slots: a flight that is not over after so many slots is truncated; None: at its `timeout_s`.
     :param render_mode: "ansi", "human" or None.
     :param settings: as for :func:`dtsa.run_config`, if there is no config.
+
+    >>> env = parallel_env(agents=4, slots=50)
+    >>> observations, infos = env.reset(seed=1)
+    >>> observations, rewards, *_ = env.step({agent: int(agent == "agent_1") for agent in env.agents})
+
     :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
     """
-    if config is not None and settings:
-        raise ConfigError("settings", sorted(settings), "none beside a config")
     if "policy" in settings:
         raise ConfigError("policy", settings["policy"], "none: the actions say who sends")
-    run = run_config(**settings) if config is None else config
-    return SwarmEnv(run, reward=reward, slots=slots, render_mode=render_mode)
+    return SwarmEnv(config_of(config, settings), reward=reward, slots=slots, render_mode=render_mode)

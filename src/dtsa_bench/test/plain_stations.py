@@ -8,8 +8,7 @@ from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference import station as reference
 from dtsa_agent.core.reference.agent import Agent
 from dtsa_agent.core.reference.arithmetic import Vector
-from dtsa_agent.core.reference.rules import Rules
-from dtsa_agent.core.reference.table import Table
+from dtsa_agent.core.reference.table import Rules, Table
 from dtsa_bench.simulation.live import LiveFlight, S, _c_flight, fly
 
 STARTED, RECEIVED, STEPPED = lib.LIVE_STARTED, lib.LIVE_RECEIVED, lib.LIVE_STEPPED  # kinds of a live_call

@@ -17,7 +17,7 @@ from pathlib import Path
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import VARIABLE
 
-from . import Row
+from . import Measurement
 
 AGENTS, SLOT_S = 12, 0.01
 WINDOW_S = 20.0
@@ -26,7 +26,7 @@ PATIENCE_S = 180.0
 SHARE = 0.5  # of the other form's processor time at most
 
 
-def agents() -> Iterator[Row]:
+def agents() -> Iterator[Measurement]:
     """Processor time of a slot and agent, and memory: `lease`, twelve agents, slots of 10 ms, no bags."""
     with tempfile.TemporaryDirectory() as place:
         udp, ros = _start_agents(), _start_flight(Path(place) / "flight")
@@ -34,10 +34,10 @@ def agents() -> Iterator[Row]:
             nodes = _wait_for_nodes(ros, Path(place) / "flight")
             time.sleep(BEGIN_S + SETTLE_S)
             forms = {"UDP": [process.pid for process in udp], "ROS": nodes}
-            before, begun = {name: _processor_s(pids) for name, pids in forms.items()}, time.monotonic()
+            before, start = {name: _processor_s(pids) for name, pids in forms.items()}, time.monotonic()
             time.sleep(WINDOW_S)
             used = {name: _processor_s(pids) - before[name] for name, pids in forms.items()}
-            slots = (time.monotonic() - begun) / SLOT_S
+            slots = (time.monotonic() - start) / SLOT_S
             cost = {name: 1e6 * used[name] / slots / AGENTS for name in forms}
             memory = {name: _memory_mb(pids) for name, pids in forms.items()}
             _end_agents(udp)
@@ -48,9 +48,9 @@ def agents() -> Iterator[Row]:
                 process.wait(PATIENCE_S)
     ratio = cost["UDP"] / cost["ROS"]
     what, other = "a slot of an agent over UDP", f"as a ROS node {cost['ROS']:.3g} us"
-    yield Row(what, f"{cost['UDP']:.3g} us", other, ratio, f"<= {SHARE:g}", ratio <= SHARE)
+    yield Measurement(what, f"{cost['UDP']:.3g} us", other, ratio, f"<= {SHARE:g}", ratio <= SHARE)
     other = f"as a ROS node {memory['ROS']:.3g} MB"
-    yield Row("its memory (PSS)", f"{memory['UDP']:.3g} MB", other, memory["UDP"] / memory["ROS"])
+    yield Measurement("its memory (PSS)", f"{memory['UDP']:.3g} MB", other, memory["UDP"] / memory["ROS"])
 
 
 def _start_agents() -> list[subprocess.Popen[str]]:

@@ -28,7 +28,7 @@ from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS
 from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.simulation.simulate import simulate
 
-from . import Row
+from . import Measurement
 
 Array = NDArray[np.float64]
 State = tuple[Array, Array, Array]  # position, velocity, preferred velocity, each (3, N)
@@ -52,20 +52,20 @@ FLIGHTS: tuple[tuple[dict[str, Any], float], ...] = (
 
 def seconds(call: Callable[[], object], least_s: float = 0.1) -> float:
     """Median time of one call, s, of batches of about a hundredth of ``least_s`` each, for ``least_s`` in all."""
-    begun = time.perf_counter()
+    start = time.perf_counter()
     call()
-    batch = max(1, int(least_s / 100 / max(time.perf_counter() - begun, 1e-8)))
+    batch = max(1, int(least_s / 100 / max(time.perf_counter() - start, 1e-8)))
     samples: list[float] = []
     end = time.perf_counter() + least_s
     while time.perf_counter() < end or len(samples) < 5:
-        begun = time.perf_counter()
+        start = time.perf_counter()
         for _ in range(batch):
             call()
-        samples.append((time.perf_counter() - begun) / batch)
+        samples.append((time.perf_counter() - start) / batch)
     return statistics.median(samples)
 
 
-def kernels() -> Iterator[Row]:
+def kernels() -> Iterator[Measurement]:
     """The priorities g of all agents beside vectorised NumPy, the frame's codec, and avoidance beside pyrvo's."""
     for agents in SIZES:
         p, v = np.random.default_rng(1).normal(size=(2, agents, 3)) * np.array([[[5.0]], [[1.0]]])
@@ -73,15 +73,15 @@ def kernels() -> Iterator[Row]:
         call()
         assert np.allclose(g, _numpy_priority(p, v, STEP_S), rtol=1e-9)
         ours, plain = (1e6 * seconds(f) for f in (call, partial(_numpy_priority, p, v, STEP_S)))
-        yield Row(f"priorities of all, N = {agents}", f"{ours:.3g} us", f"NumPy {plain:.3g} us", ours / plain)
+        yield Measurement(f"priorities of all, N = {agents}", f"{ours:.3g} us", f"NumPy {plain:.3g} us", ours / plain)
     frame = Frame(7, 1234, 1, (1.0, -2.0, 0.5), (0.3, 0.2, -0.1))
     data = encode_frame(frame)
-    yield Row("a frame encoded", f"{1e6 * seconds(lambda: encode_frame(frame)):.3g} us")
-    yield Row("a frame decoded", f"{1e6 * seconds(lambda: decode_frame(data)):.3g} us")
+    yield Measurement("a frame encoded", f"{1e6 * seconds(lambda: encode_frame(frame)):.3g} us")
+    yield Measurement("a frame decoded", f"{1e6 * seconds(lambda: decode_frame(data)):.3g} us")
     for agents in SIZES:
         ours, pyrvo = _avoidance_us(agents)
         other = {"other": f"pyrvo {pyrvo:.3g} us", "ratio": ours / pyrvo} if pyrvo else {"other": "pyrvo is missing"}
-        yield Row(f"avoidance of all, N = {agents}", f"{ours:.3g} us", **other)
+        yield Measurement(f"avoidance of all, N = {agents}", f"{ours:.3g} us", **other)
 
 
 def _priorities(position: Array, velocity: Array) -> tuple[Array, Callable[[], object]]:
@@ -136,10 +136,10 @@ def _avoidance_us(agents: int, repeats: int = 5) -> tuple[float, float | None]:
     swarm = _knowing_swarm(agents)
     swarm.goal[:] = goal
 
-    def put_ours(state: State) -> None:
+    def place_ours(state: State) -> None:
         swarm.position[:], swarm.velocity[:] = state[0], state[1]
 
-    ours = _mean_of_medians(states, put_ours, lambda: swarm.fly(0), repeats)
+    ours = _mean_of_medians(states, place_ours, lambda: swarm.fly(0), repeats)
     try:
         import pyrvo
     except ImportError:
@@ -149,14 +149,14 @@ def _avoidance_us(agents: int, repeats: int = 5) -> tuple[float, float | None]:
     for x, y in states[0][0][:2].T:
         simulator.add_agent((float(x), float(y)))
 
-    def put_pyrvo(state: State) -> None:
+    def place_pyrvo(state: State) -> None:
         position, velocity, wish = state
         for k in range(agents):
             simulator.set_agent_position(k, (float(position[0, k]), float(position[1, k])))
             simulator.set_agent_velocity(k, (float(velocity[0, k]), float(velocity[1, k])))
             simulator.set_agent_pref_velocity(k, (float(wish[0, k]), float(wish[1, k])))
 
-    return ours, _mean_of_medians(states, put_pyrvo, simulator.do_step, repeats)
+    return ours, _mean_of_medians(states, place_pyrvo, simulator.do_step, repeats)
 
 
 def _mean_of_medians(
@@ -167,20 +167,20 @@ def _mean_of_medians(
         samples = []
         for _ in range(repeats):
             put(state)
-            begun = time.perf_counter()
+            start = time.perf_counter()
             step()
-            samples.append(time.perf_counter() - begun)
+            samples.append(time.perf_counter() - start)
         times.append(statistics.median(samples))
     return 1e6 * statistics.fmean(times)
 
 
-def slots() -> Iterator[Row]:
+def slots() -> Iterator[Measurement]:
     """A whole slot (policy, estimates, avoider, physics), averaged over a flight, beside pyrvo's avoidance alone."""
     for agents in SIZES:
         _, pyrvo = _avoidance_us(agents)
         for policy in POLICIES:
             ours = slot_us(agents, policy)
-            row = Row(f"whole slot, {policy}, N = {agents}", f"{ours:.3g} us")
+            row = Measurement(f"whole slot, {policy}, N = {agents}", f"{ours:.3g} us")
             if pyrvo:
                 limit = 1.0 if policy == "dtsa" and agents > 70 else 0.5
                 row = row._replace(
@@ -206,24 +206,26 @@ def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0
     while not times or sum(times) < least_s:
         swarm.reset()
         scenario.advance(0, swarm)
-        begun = time.perf_counter()
+        start = time.perf_counter()
         for slot in range(count):
             swarm.complete(slot, swarm.begin(slot))
-        times.append(time.perf_counter() - begun)
+        times.append(time.perf_counter() - start)
     return 1e6 * min(times) / count
 
 
-def flights(repeats: int = 12) -> Iterator[Row]:
+def flights(repeats: int = 12) -> Iterator[Measurement]:
     """Whole flights as `simulate` flies them, metrics included: the fastest of each; and what sets one up."""
     for settings, limit_s in FLIGHTS:
         best = _fastest(settings, repeats if limit_s < 1 else 2)
         what = ", ".join(f"{key} {value}" for key, value in settings.items() if key not in ("agents", "timeout_s"))
         target = f"<= {1e3 * limit_s:g} ms"
-        yield Row(f"flight of {settings['agents']}, {what}", f"{1e3 * best:.3g} ms", target=target, met=best <= limit_s)
+        yield Measurement(
+            f"flight of {settings['agents']}, {what}", f"{1e3 * best:.3g} ms", target=target, met=best <= limit_s
+        )
     for settings, _ in (FLIGHTS[0], FLIGHTS[3]):
         whole, setup = _fastest(settings, repeats), _fastest({**settings, "timeout_s": STEP_S}, repeats)
         what = f"set-up and one slot of a flight of {settings['agents']}"
-        yield Row(what, f"{1e3 * setup:.3g} ms", f"whole flight {1e3 * whole:.3g} ms", setup / whole)
+        yield Measurement(what, f"{1e3 * setup:.3g} ms", f"whole flight {1e3 * whole:.3g} ms", setup / whole)
 
 
 def _fastest(settings: dict[str, Any], repeats: int) -> float:
@@ -231,7 +233,7 @@ def _fastest(settings: dict[str, Any], repeats: int) -> float:
     run = run_config({**settings, "seed": 1})
     times = []
     for _ in range(repeats):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         simulate(run)
-        times.append(time.perf_counter() - begun)
+        times.append(time.perf_counter() - start)
     return min(times)

@@ -31,7 +31,7 @@ from dtsa_bench.flights.domain import ros_domain
 from dtsa_bench.flights.flight import fly, run_environment
 from dtsa_bench.flights.options import FlightOptions
 
-from . import Row
+from . import Measurement
 
 TARGETS = ((4, 4, None), (12, 12, 200.0), (18, 1, 500.0), (70, 2, 200.0))  # agents, processes, slots/s
 SLOTS, REPEATS = 1000, 3
@@ -40,7 +40,7 @@ _ASK, _ANSWER, _OVER = "/bare_round/ask", "/bare_round/answer", 2**32 - 1
 _START_S = 60.0
 
 
-def nodes() -> Iterator[Row]:
+def nodes() -> Iterator[Measurement]:
     """Slots a second; where each agent has a process, bare rounds in turn: the machine changes within minutes."""
     for agents, processes, limit in TARGETS:
         run = run_config({"agents": agents, "timeout_s": SLOTS / 100, "stop_on_crash": False})
@@ -52,7 +52,7 @@ def nodes() -> Iterator[Row]:
             rates.append(summary["slots"]["total"] / summary["wall_time_s"])
             if processes == agents:
                 bare.append(rounds_per_s(processes, SLOTS, 2)[-1])  # the first ones are slower
-        row = Row(f"nodes in lockstep, agents {agents}, processes {processes}", f"{max(rates):.0f} slots/s")
+        row = Measurement(f"nodes in lockstep, agents {agents}, processes {processes}", f"{max(rates):.0f} slots/s")
         if bare:
             ratio = statistics.median(rounds / slots for rounds, slots in zip(bare, rates, strict=True))
             row = row._replace(other=f"bare rounds {statistics.median(bare):.0f}/s", ratio=ratio)
@@ -102,14 +102,14 @@ class _Asker:
             self._loop.close()
 
     def _meet(self) -> None:
-        """Asks until all have answered one question."""
+        """Ask until all have answered one question."""
         deadline = time.monotonic() + _START_S
         while (heard := self._round(patience_s=0.2)) < self._processes:
             if time.monotonic() > deadline:
                 raise DtsaError(f"only {heard} of {self._processes} processes answer after {_START_S:g} s")
 
     def _round(self, patience_s: float = math.inf) -> int:
-        """Asks once; how many have answered that within a time."""
+        """Ask once; how many have answered that within a time."""
         self._number += 1
         self._publisher.publish(UInt32(data=self._number))
         end, heard = time.monotonic() + patience_s, 0

@@ -40,14 +40,14 @@ _ROLE = re.compile(r":(?:class|func|meth|mod|data|attr|exc):\s?<code>[.~]?")
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds the pages that are not in `docs`."""
+    """Add the pages that are not in `docs`."""
     for name, place in TOP.items():
         files.append(File.generated(config, place, content=(ROOT / name).read_text(encoding="utf-8")))
     for place, page in MADE.items():
         files.append(File.generated(config, place, content=page()))
     for file in list(files.documentation_pages()):
-        for found in _LINK.finditer(file.content_string):
-            path = _path(file.src_uri, found["url"])
+        for match in _LINK.finditer(file.content_string):
+            path = _path(file.src_uri, match["url"])
             if path is not None and path.is_file() and files.get_file_from_path(_on_site(path)) is None:
                 files.append(File.generated(config, _on_site(path), abs_src_path=str(path)))
     return files
@@ -59,21 +59,21 @@ def on_page_markdown(markdown: str, page: Page, config: Any, files: Files) -> st
     boost = BOOST.get(place, BOOST.get(place.partition("/")[0], 1.0))
     page.meta.setdefault("search", {}).setdefault("boost", boost)
 
-    def link(found: re.Match[str]) -> str:
-        url = found["url"]
+    def link(match: re.Match[str]) -> str:
+        url = match["url"]
         path = _path(place, url)
         if path is None or not path.exists():
-            return found[0]
+            return match[0]
         if path.is_dir():
-            return found["label"]
+            return match["label"]
         anchor = url.partition("#")[1] + url.partition("#")[2]
-        return f"[{found['label']}]({os.path.relpath(_on_site(path), Path(place).parent)}{anchor})"
+        return f"[{match['label']}]({os.path.relpath(_on_site(path), Path(place).parent)}{anchor})"
 
     return _LINK.sub(link, tables.filled(markdown))
 
 
 def on_page_content(html: str, page: Page, config: Any, files: Files) -> str:
-    """Takes away the roles that docstrings write before names."""
+    """Remove the roles that docstrings write before names."""
     return _ROLE.sub("<code>", html)
 
 
@@ -82,7 +82,7 @@ def _path(place: str, url: str) -> Path | None:
     name = url.partition("#")[0]
     if not name or "://" in url or url.startswith("mailto:") or place in MADE:
         return None
-    source = {there: ROOT / here for here, there in TOP.items()}.get(place, ROOT / "docs" / place)
+    source = {place_on_site: ROOT / here for here, place_on_site in TOP.items()}.get(place, ROOT / "docs" / place)
     path = Path(os.path.normpath(source.parent / name))
     inside = source.is_relative_to(ROOT / "docs") and path.is_relative_to(ROOT / "docs")
     return None if inside or not path.is_relative_to(ROOT) else path

@@ -36,7 +36,6 @@ from . import table
 
 _EVERY_NODE = re.compile(r"/tf|/rosout|/parameter_events|.*/(\w*parameters?(_\w+)?|get_type_description)$")
 _ELSEWHERE = (SwarmConfig, ChannelConfig, RunLimits, ClockConfig)  # settings that have tables of their own
-_OF_ROS = ("use_sim_time", "start_type", "qos_overrides")
 _AGENT = re.compile(r"/cf\d+/")
 NODES: dict[str, tuple[Callable[[Sequence[str]], int], tuple[str, ...]]] = {
     "agent": (agent_node.main, ("id:=1", "agents:=2")),

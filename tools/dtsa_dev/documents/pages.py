@@ -1,8 +1,12 @@
-"""Pages of the site that are made from the code while it is built: commands, messages, the library."""
+"""Pages of the site that are made from the code while it is built: commands, messages, the library.
+
+`python -m dtsa_dev.documents.pages` writes the settings of `dtsa.simulate`, as type checkers and editors read them.
+"""
 
 from __future__ import annotations
 
 import argparse
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,17 +14,19 @@ from pathlib import Path
 import dtsa
 from dtsa_agent.core.plugins import kinds
 from dtsa_bench.commands import cli, registry
+from dtsa_bench.experiments.sweep import setting_specs
 from dtsa_dev import registry as developers
 
 from . import table
 
-_TYPES = Path(__file__).resolve().parents[3] / "src" / "dtsa_msgs"
+_SOURCES = Path(__file__).resolve().parents[3] / "src"
+_TYPES = _SOURCES / "dtsa_msgs"
 _SETTINGS = ("RunConfig", "SwarmConfig", "ChannelConfig", "ClockConfig", "RunLimits")
 _GROUPS = {
     "One flight": ("simulate", "run_config", "FlightLog"),
     "Many flights": ("sweep", "SweepResult"),
     "Recorded runs": ("open", "verify", "Verification", "Difference"),
-    "What a plug-in is given": ("register", "Table"),
+    "What a plug-in is given": ("register", "Table", "plug_in_random"),
     "Figures": (*(name for name in dtsa.__all__ if name.startswith("plot_")), "agent_colour"),
     "One agent, one channel": ("Agent", "Decision", "SlotOutcome", "Channel", "Verdict"),
     "Settings": _SETTINGS,
@@ -47,10 +53,11 @@ def commands() -> str:
 
 
 def _command(name: str, text: str) -> str:
-    whole, module = cli.build_parser(name)
+    whole, command = cli.build_parser(name)
+    assert command is not None
     parser = whole.commands[name]
     parts = [f"## {name}\n\n{parser.description or text}\n\n"]
-    lines = [f"dtsa {name} {words}".rstrip() + f"    # {what}\n" for words, what in module.EXAMPLES]
+    lines = [f"dtsa {name} {words}".rstrip() + f"    # {what}\n" for words, what in command.examples]
     parts += ["```sh\n", *lines, "```\n\n"] if lines else []
     for group in parser._action_groups:
         rows = [_argument(parser, action) for action in group._group_actions if action.help != argparse.SUPPRESS]
@@ -106,6 +113,28 @@ def _library() -> Iterator[str]:
             yield _entry(f"{getattr(dtsa.env, name).__module__}.{name}", True)
 
 
+def run_settings() -> str:
+    """The module ``dtsa/_settings.py``: a TypedDict of all settings that `simulate` takes by name."""
+    simple = {"int": "int", "float": "float", "bool": "bool", "text": "str", "values": "Mapping[str, float]"}
+    lines = []
+    for name in sorted(names := setting_specs()):
+        spec = names[name]
+        closed = spec.kind == "text" and spec.words and not spec.open_choices
+        words = [json.dumps(word) for word in spec.choices] if closed else []
+        text = f"Literal[{', '.join(words)}]"
+        text = text if len(text) < 80 else "".join(["Literal[\n", *(f"        {word},\n" for word in words), "    ]"])
+        kind = text if closed else simple.get(spec.kind, "Any")
+        kind = "Any" if spec.custom else f"{kind} | None" if spec.optional else kind
+        lines.append(f"    {name}: {kind}\n")
+    return (
+        '"""The settings of `simulate` and `run_config`: made by `python -m dtsa_dev.documents.pages`."""\n\n'
+        "from __future__ import annotations\n\nfrom collections.abc import Mapping\n"
+        "from typing import Any, Literal, TypedDict\n\n\n"
+        "class RunSettings(TypedDict, total=False):\n"
+        '    """Units and ranges: docs/reference/settings.md and docs/reference/channel.md."""\n\n' + "".join(lines)
+    )
+
+
 def _kinds() -> list[str]:
     text = Path(kinds.__file__).read_text(encoding="utf-8")
     return re.findall(r"^class (\w+)\(Protocol\)", text, re.MULTILINE)
@@ -113,3 +142,7 @@ def _kinds() -> list[str]:
 
 def _entry(identifier: str, members: bool) -> str:
     return f"::: {identifier}\n" + ("" if members else "    options: {members: false}\n") + "\n"
+
+
+if __name__ == "__main__":
+    (_SOURCES / "dtsa_bench" / "dtsa" / "_settings.py").write_text(run_settings(), encoding="utf-8")

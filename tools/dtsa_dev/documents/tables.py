@@ -44,13 +44,13 @@ def filled(text: str) -> str:
             return evidence(name.removeprefix("evidence "))
         if name not in TABLES:
             raise ConfigError("table", name, ", ".join(TABLES))
-        return _made(name)
+        return _table_of(name)
 
     return _PLACE.sub(fill, text)
 
 
 @cache  # `docs --serve` builds the site again and again
-def _made(name: str) -> str:
+def _table_of(name: str) -> str:
     return TABLES[name]()
 
 
@@ -178,10 +178,12 @@ def evidence(name: str) -> str:
     low, high = record.get("load", [0.0, 0.0])
     passed = f"{record['passed']} passed in {record['minutes']:.0f} minutes, " if "passed" in record else ""
     sizes = f"{record['sizes']}. " if "sizes" in record else ""
-    made = f"`tools/dtsa {record['command']}`, {record['date']}: {passed}{record['cores']} cores, {record['versions']}"
+    source = (
+        f"`tools/dtsa {record['command']}`, {record['date']}: {passed}{record['cores']} cores, {record['versions']}"
+    )
     loaded = f", load {low:g} to {high:g}" if "load" in record else ""
     rows = f"{table(record['heads'], record['rows'])}\n" if record["rows"] else ""
-    return f"{rows}{sizes}{made}{loaded} ([record]({name}.json)).\n"
+    return f"{rows}{sizes}{source}{loaded} ([record]({name}.json)).\n"
 
 
 def _records() -> str:
@@ -209,7 +211,7 @@ def _league() -> str:
         )
         for entry in scores.entries
     ]
-    flights = sum(found.lost.total for found in scores.scores)
+    flights = sum(score.lost.total for score in scores.scores)
     return "\n".join([
         f"{len(flown)} entries, {flights:,} flights ([all of them](league-1.json)). 95 % intervals in brackets.\n",
         table(HEADS, scores.lines()),

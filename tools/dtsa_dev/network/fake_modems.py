@@ -56,7 +56,7 @@ class FakeModemSettings:
 
 
 @dataclass(slots=True)
-class _One:
+class _FakeModem:
     """One modem."""
 
     master: int = -1  # of its pseudo terminal; -1: it is unplugged
@@ -81,7 +81,7 @@ class FakeModems:
         self._byte_ns = _BITS * _SECOND // settings.line_baud
         self._channel, self._began_ns = Channel(channel), time.monotonic_ns()
         self._draw = random.Random(channel.seed)
-        self._ones = [_One() for _ in range(settings.count)]
+        self._ones = [_FakeModem() for _ in range(settings.count)]
         #: Paths of the devices.
         self.devices = [directory / f"modem{number}" for number in range(1, settings.count + 1)]
         self._events: list[tuple[int, int, int, int, bytes]] = []  # a heap: ns, entry, kind, modem, bytes
@@ -106,30 +106,30 @@ class FakeModems:
 
     # -- from outside -----------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
-        """Changes the channel from now on: ``loss``, ``partition`` and others by name."""
+        """Change the channel from now on: ``loss``, ``partition`` and others by name."""
         with self._lock:
             self._channel.advance(self._slot(time.monotonic_ns()))
             self._channel.set(**values)
 
     def unplug(self, number: int) -> None:
-        """Takes a modem away from its computer; what it holds is lost."""
+        """Take a modem away from its computer; what it holds is lost."""
         with self._lock:
-            one = self._ones[number - 1]
+            modem = self._ones[number - 1]
             self.devices[number - 1].unlink()
-            os.close(one.master)
-            os.close(one.slave)
-            one.master = one.slave = -1
-            one.buffer = b""
+            os.close(modem.master)
+            os.close(modem.slave)
+            modem.master = modem.slave = -1
+            modem.buffer = b""
         self._wake()
 
     def plug(self, number: int) -> None:
-        """Puts a modem back, as another device."""
+        """Put a modem back, as another device."""
         with self._lock:
             self._plug(number - 1)
         self._wake()
 
     def inject(self, number: int, data: bytes) -> None:
-        """Lets other bytes come out of a modem."""
+        """Let other bytes come out of a modem."""
         with self._lock:
             self._write(number - 1, data)
 
@@ -142,22 +142,22 @@ class FakeModems:
         self._wake()
         if self._thread.ident is not None:
             self._thread.join()
-        for index, one in enumerate(self._ones):
-            if one.master >= 0:
+        for index, modem in enumerate(self._ones):
+            if modem.master >= 0:
                 self.devices[index].unlink(missing_ok=True)
-                os.close(one.master)
-                os.close(one.slave)
+                os.close(modem.master)
+                os.close(modem.slave)
         os.close(self._wake_read)
         os.close(self._wake_write)
 
     def _plug(self, index: int) -> None:
-        one = self._ones[index]
-        one.master, one.slave = os.openpty()
-        tty.setraw(one.slave)
-        os.set_blocking(one.master, False)
+        modem = self._ones[index]
+        modem.master, modem.slave = os.openpty()
+        tty.setraw(modem.slave)
+        os.set_blocking(modem.master, False)
         path = self.devices[index]
         path.unlink(missing_ok=True)
-        path.symlink_to(os.ttyname(one.slave))
+        path.symlink_to(os.ttyname(modem.slave))
 
     def _wake(self) -> None:
         os.write(self._wake_write, b"x")
@@ -166,7 +166,7 @@ class FakeModems:
     def _run(self) -> None:
         while not self._stopped:
             with self._lock:
-                masters = {one.master: index for index, one in enumerate(self._ones) if one.master >= 0}
+                masters = {modem.master: index for index, modem in enumerate(self._ones) if modem.master >= 0}
                 wait_ns = self._events[0][0] - time.monotonic_ns() if self._events else _SECOND
             wait_s = min(max(wait_ns, 0) / _SECOND, _PATIENCE_S)
             ready = select.select([self._wake_read, *masters], [], [], wait_s)[0]
@@ -195,42 +195,42 @@ class FakeModems:
 
     def _read(self, index: int, now_ns: int) -> None:
         """A program has written: its bytes come over the line one after the other."""
-        one = self._ones[index]
+        modem = self._ones[index]
         try:
-            data = os.read(one.master, _READ)
+            data = os.read(modem.master, _READ)
         except OSError:
             return
-        if self._wrong_speed(one):
+        if self._wrong_speed(modem):
             data = bytes(self._draw.randrange(256) for _ in data)
         if self.settings.echo:
             self._out(index, data, now_ns)
-        room = self._kind.buffer - len(one.buffer)
+        room = self._kind.buffer - len(modem.buffer)
         self.counts["overflowed_bytes"] += max(0, len(data) - room)
         data = data[: max(room, 0)]
-        one.buffer += data
-        one.last_ns = max(one.last_ns, now_ns) + len(data) * self._byte_ns
+        modem.buffer += data
+        modem.last_ns = max(modem.last_ns, now_ns) + len(data) * self._byte_ns
         self._plan(index, now_ns)
 
-    def _wrong_speed(self, one: _One) -> bool:
+    def _wrong_speed(self, modem: _FakeModem) -> bool:
         """Whether the program has set another speed than the modem's."""
         with suppress(termios.error):
-            speed: int = termios.tcgetattr(one.slave)[5]
+            speed: int = termios.tcgetattr(modem.slave)[5]
             return speed != getattr(termios, f"B{self.settings.line_baud}", speed)
         return False
 
     def _plan(self, index: int, now_ns: int) -> None:
         """When a modem sends next what it has."""
-        one, kind = self._ones[index], self._kind
-        if not one.buffer:
-            one.due_ns = 0
+        modem, kind = self._ones[index], self._kind
+        if not modem.buffer:
+            modem.due_ns = 0
             return
         # Bytes that a program wrote at once are on the line one after the other: a packet is full before the last.
-        first_ns = one.last_ns - max(0, len(one.buffer) - kind.packet) * self._byte_ns
-        ready_ns = first_ns if len(one.buffer) >= kind.packet else one.last_ns + kind.gap_bytes * self._byte_ns
-        due_ns = max(ready_ns, one.sending_ns, now_ns)
+        first_ns = modem.last_ns - max(0, len(modem.buffer) - kind.packet) * self._byte_ns
+        ready_ns = first_ns if len(modem.buffer) >= kind.packet else modem.last_ns + kind.gap_bytes * self._byte_ns
+        due_ns = max(ready_ns, modem.sending_ns, now_ns)
         if kind.turn_ns:
             due_ns = self._turn(index, due_ns)
-        one.due_ns = due_ns
+        modem.due_ns = due_ns
         self._at(due_ns, _SEND, index)
 
     def _turn(self, index: int, when_ns: int) -> int:
@@ -242,14 +242,14 @@ class FakeModems:
         return since_ns + (passed + ahead) * turn_ns
 
     def _send(self, index: int, now_ns: int) -> None:
-        one, kind = self._ones[index], self._kind
-        packet, one.buffer = one.buffer[: kind.packet], one.buffer[kind.packet :]
+        modem, kind = self._ones[index], self._kind
+        packet, modem.buffer = modem.buffer[: kind.packet], modem.buffer[kind.packet :]
         if not packet:
-            one.due_ns = 0
+            modem.due_ns = 0
             return
         air_ns = now_ns + kind.turn_round_ns
         end_ns = air_ns + kind.on_air_ns(len(packet))
-        one.sending_ns = end_ns
+        modem.sending_ns = end_ns
         self._air.append(OnAir(index + 1, now_ns, air_ns, end_ns))
         self.counts["packets"] += 1
         self.packets_of[index + 1] += 1
@@ -264,9 +264,11 @@ class FakeModems:
 
     def _end(self, now_ns: int, index: int, data: bytes) -> None:
         """A packet has left the air: the medium says who has it."""
-        frame = next(one for one in self._air if one.sender == index + 1 and one.end_ns == now_ns)
+        frame = next(burst for burst in self._air if burst.sender == index + 1 and burst.end_ns == now_ns)
         others = [
-            one for one in self._air if one is not frame and one.start_ns < frame.end_ns and one.end_ns > frame.start_ns
+            each
+            for each in self._air
+            if each is not frame and each.start_ns < frame.end_ns and each.end_ns > frame.start_ns
         ]
         slot = self._slot(frame.start_ns)
         received, lost, collided = self._channel.medium(slot).resolve(slot, frame, others)
@@ -276,25 +278,25 @@ class FakeModems:
         for receiver in received.nonzero()[0].tolist():
             self.counts["received"] += 1
             self._out(receiver, data, now_ns)
-        oldest_ns = min((one.start_ns for one in self._air if one.end_ns >= now_ns), default=now_ns)
-        self._air = [one for one in self._air if one.end_ns > oldest_ns]
+        oldest_ns = min((burst.start_ns for burst in self._air if burst.end_ns >= now_ns), default=now_ns)
+        self._air = [burst for burst in self._air if burst.end_ns > oldest_ns]
 
     def _out(self, index: int, data: bytes, now_ns: int) -> None:
         """A modem gives its computer what it has, and a USB adapter keeps it for a while."""
-        settings, one = self.settings, self._ones[index]
+        settings, modem = self.settings, self._ones[index]
         if self._draw.random() < settings.garbage:
             data = self._draw.randbytes(self._draw.randrange(1, 60)) + data
-        one.out_ns = max(one.out_ns, now_ns) + len(data) * self._byte_ns
+        modem.out_ns = max(modem.out_ns, now_ns) + len(data) * self._byte_ns
         late_ms = settings.latency_ms + settings.jitter_ms * self._draw.random()
-        self._at(one.out_ns + round(late_ms * 1e6), _OUT, index, data)
+        self._at(modem.out_ns + round(late_ms * 1e6), _OUT, index, data)
 
     def _write(self, index: int, data: bytes) -> None:
-        one = self._ones[index]
-        if one.master >= 0:
-            if self._wrong_speed(one):
+        modem = self._ones[index]
+        if modem.master >= 0:
+            if self._wrong_speed(modem):
                 data = self._draw.randbytes(len(data))
             with suppress(OSError):  # its program reads nothing: a real line would lose it, too
-                os.write(one.master, data)
+                os.write(modem.master, data)
 
     def _slot(self, now_ns: int) -> int:
         return max(0, now_ns - self._began_ns) // _SLOT_NS

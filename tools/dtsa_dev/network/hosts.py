@@ -36,7 +36,7 @@ class Unavailable(DtsaError):
 
 
 @dataclass(frozen=True, slots=True)
-class Host:
+class EmulatedHost:
     """One computer."""
 
     number: int  # from 1
@@ -70,9 +70,9 @@ class Host:
     def plug(self, address: str) -> None:
         """An interface of the same name is made anew."""
         with inside(self):
-            made = _new_cable(address)
-            os.dup2(made, self.cable, inheritable=False)
-            os.close(made)
+            cable = _new_cable(address)
+            os.dup2(cable, self.cable, inheritable=False)
+            os.close(cable)
 
     def readdress(self, address: str) -> None:
         """Its interface gets another address in place of the one that it has."""
@@ -86,20 +86,20 @@ class Host:
 
 
 @contextmanager
-def hosts(count: int) -> Iterator[list[Host]]:
+def hosts(count: int) -> Iterator[list[EmulatedHost]]:
     """Some hosts, until the end of the context; processes on them have ended by then."""
     with ExitStack() as stack:
         home = _opened(stack, _OWN, os.O_RDONLY)
         try:
-            found = [_made(stack, number) for number in range(1, count + 1)]
+            started = [_start_host(stack, number) for number in range(1, count + 1)]
         finally:
             if _libc().setns(home, _CLONE_NEWNET):
                 os._exit(1)  # whatever this process did from here on would be in the wrong place
-        yield found
+        yield started
 
 
 @contextmanager
-def inside(host: Host) -> Iterator[None]:
+def inside(host: EmulatedHost) -> Iterator[None]:
     """Until the end of the context this thread is on a host: sockets that it makes stay there."""
     home = os.open(_OWN, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -133,7 +133,7 @@ def why_not() -> str:
         return str(error)
 
 
-def _made(stack: ExitStack, number: int) -> Host:
+def _start_host(stack: ExitStack, number: int) -> EmulatedHost:
     """A host; this thread is in it afterwards."""
     try:
         if _libc().unshare(_CLONE_NEWNET):
@@ -142,7 +142,7 @@ def _made(stack: ExitStack, number: int) -> Host:
         cable = _new_cable(address)
         stack.callback(os.close, cable)
         _set_up("lo", True)
-        return Host(number, address, cable, _opened(stack, _OWN, os.O_RDONLY))
+        return EmulatedHost(number, address, cable, _opened(stack, _OWN, os.O_RDONLY))
     except OSError as error:
         raise Unavailable(f"no network namespaces with TAP devices here: {error.strerror or error}") from None
 

@@ -25,7 +25,7 @@ from dtsa_agent.core.frame import named_in
 from dtsa_agent.priority import wake_precisely
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
-from .hosts import Host, arrived
+from .hosts import EmulatedHost, arrived
 
 _ETHERNET, _IPV4, _UDP = 14, 0x0800, 17
 _SECOND = 1_000_000_000
@@ -36,7 +36,7 @@ _FLOOD = 20  # frames at a time, now and then
 
 
 @dataclass(frozen=True, slots=True)
-class OnAir:
+class CarriedDatagram:
     """A datagram that was on the air."""
 
     start_ns: int  # since the switch began
@@ -62,7 +62,7 @@ class Switch:
     """Joins hosts."""
 
     def __init__(
-        self, joined: Sequence[Host], group: tuple[str, int], config: ChannelConfig, links: Links | None = None
+        self, joined: Sequence[EmulatedHost], group: tuple[str, int], config: ChannelConfig, links: Links | None = None
     ) -> None:
         self._hosts = {host.cable: host for host in joined}
         self._cables = {host.number: host.cable for host in joined}
@@ -76,7 +76,7 @@ class Switch:
         self._due: list[tuple[int, int, int, bytes]] = []  # deliveries: when, number, cable, Ethernet frame: a heap
         self._count = 0
         self._zero = time.monotonic_ns()
-        self.log: list[OnAir] = []
+        self.log: list[CarriedDatagram] = []
         #: Is told each Ethernet frame that has left the air.
         self.listener: Callable[[bytes], None] | None = None
         self.left_out = 0  # Ethernet frames that were nothing for the air
@@ -107,7 +107,7 @@ class Switch:
             settled = self.now_ns  # what begins before this is read now
             for cable in ready:
                 self._read(cable)
-            self._settle(settled)
+            self._resolve(settled)
             self._deliver()
 
     def _read(self, cable: int) -> None:
@@ -133,7 +133,7 @@ class Switch:
             return b""
         return packet[head + 8 : head + int.from_bytes(packet[head + 4 : head + 6], "big")]
 
-    def _settle(self, until_ns: int) -> None:
+    def _resolve(self, until_ns: int) -> None:
         for verdict in self._air.resolve(until_ns):
             frame, agent, slot = self._frames.pop(verdict.frame_id)
             numbers = [int(k) + 1 for k in np.flatnonzero(verdict.received) if int(k) + 1 in self._cables]
@@ -145,7 +145,7 @@ class Switch:
                     entry = (verdict.arrival_ns + delay, self._count, self._cables[number], frame)
                     heapq.heappush(self._due, entry)
             self.log.append(
-                OnAir(
+                CarriedDatagram(
                     verdict.start_ns, verdict.end_ns, verdict.sender, agent, slot, len(numbers), verdict.lost,
                     verdict.collided,
                 )
@@ -162,7 +162,7 @@ class Switch:
             with suppress(OSError):
                 os.write(cable, frame)
 
-    def tell_all(self, frame: bytes) -> None:
+    def broadcast(self, frame: bytes) -> None:
         """Brings all hosts a frame that was never on the air."""
         for cable in self._hosts:
             with suppress(OSError):
@@ -178,15 +178,15 @@ class Intruder:
     def __init__(self, switch: Switch, seed: int) -> None:
         self._switch, self._random = switch, random.Random(seed)
         self._heard: deque[bytes] = deque(maxlen=_KEPT)
-        self.said = 0
+        self.sent_count = 0
         switch.listener = self.hear
 
     def hear(self, frame: bytes) -> None:
         """Answer an Ethernet frame that has left the air."""
         self._heard.append(frame)
         for _ in range(_FLOOD if self._random.random() < 0.01 else 1):
-            self._switch.tell_all(self._forged(frame))
-            self.said += 1
+            self._switch.broadcast(self._forged(frame))
+            self.sent_count += 1
 
     def _forged(self, frame: bytes) -> bytes:
         """A frame again; one of long ago; or one with a byte, all of the swarm's frame, or everything changed."""

@@ -52,7 +52,7 @@ class Fault:
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class CheckedFlight:
     """A flight with everything that happens in it."""
 
     swarm: SwarmConfig
@@ -68,7 +68,7 @@ class Setting:
         return f"{s.policy} {s.estimator} {s.avoider} {s.scenario} N={s.agents} {loss}"
 
 
-def random_setting(seed: int, policy: str | None = None, *, lasts: bool | None = None) -> Setting:
+def random_setting(seed: int, policy: str | None = None, *, lasts: bool | None = None) -> CheckedFlight:
     """A flight with a random policy, estimator, avoider, scenario, channel and random misfortune.
 
     :param policy: instead of a random one.
@@ -101,7 +101,7 @@ def random_setting(seed: int, policy: str | None = None, *, lasts: bool | None =
         pause_slots=int(pick([5, 40])), announce=bool(random.random() < 0.7),
         options={"margin_rate": 0.1} if random.random() < 0.3 else {}, **kind,
     )  # fmt: skip
-    return Setting(
+    return CheckedFlight(
         swarm,
         _random_channel(random, swarm, slots),
         slots,
@@ -148,7 +148,7 @@ def _deaths_and_returns(random: np.random.Generator, swarm: SwarmConfig) -> Iter
 
 
 def happen(fault: Fault, swarm: Swarm) -> None:
-    """Lets a fault happen to a swarm all of whose agents are here, before a slot begins."""
+    """Let a fault happen to a swarm all of whose agents are here, before a slot begins."""
     k = fault.agent - 1
     if fault.kind == "die":
         swarm.present[k] = 0
@@ -164,8 +164,8 @@ def happen(fault: Fault, swarm: Swarm) -> None:
         swarm.restart(k)
 
 
-def fly_both(setting: Setting) -> Mapping[str, Any]:
-    """Flies a setting on the compiled core and on the specification, side by side."""
+def fly_both(setting: CheckedFlight) -> Mapping[str, Any]:
+    """Fly a setting on the compiled core and on the specification, side by side."""
     scenario = make_scenario(setting.swarm)
     pair = Swarm(setting.swarm, scenario, shared_table=setting.shared), ReferenceSwarm(setting.swarm, scenario)
     pair[1].shares = setting.shared

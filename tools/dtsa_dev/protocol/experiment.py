@@ -19,7 +19,7 @@ FAR = 1e6  # m, a goal that nobody reaches: the agent has something to say for a
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class FlightEvent:
     """Something that happens to an agent before a slot begins.
 
     ``kind``: ``go`` (gets a goal), ``stop`` (its goal is where it is), ``join``, ``leave`` (says so in its next turn),
@@ -62,8 +62,6 @@ class Outcome:
     collision_slots: list[int] = field(default_factory=list)
     age_sum: int = 0  # over pairs (observer, agent that it takes for a mover), every slot after the warm-up
     age_count: int = 0
-    true_sum: int = 0  # over pairs (observer, agent that does move); ages count from its waking on
-    true_count: int = 0
     waits: list[Wait] = field(default_factory=list)
     ledger: GrantLedger | None = None
 
@@ -71,11 +69,6 @@ class Outcome:
     def age(self) -> float:
         """Mean age of the movers' states, slots, over agents that their observers take for movers."""
         return self.age_sum / self.age_count if self.age_count else float("nan")
-
-    @property
-    def true_age(self) -> float:
-        """The same over those that do move, whether or not their observers know."""
-        return self.true_sum / self.true_count if self.true_count else float("nan")
 
 
 def still_scenario(agents: int, seed: int, spread: float = 6.0) -> Scenario:
@@ -102,7 +95,7 @@ class Experiment:
         *,
         movers: Iterable[int] = (),
         absent: Iterable[int] = (),
-        events: Sequence[Event] = (),
+        events: Sequence[FlightEvent] = (),
         final: bool = True,
         warmup: int = 0,
         shared: bool = False,
@@ -112,7 +105,6 @@ class Experiment:
         self.channel = Channel(channel or ChannelConfig(agents=config.agents, slot_ns=config.slot_ns, seed=config.seed))
         self.warmup = warmup
         self.moving: NDArray[np.bool_] = np.zeros(config.agents, dtype=np.bool_)
-        self.moving_since: NDArray[np.int64] = np.full(config.agents, -1, dtype=np.int64)
         # Who moves flies a circle through its place, so that positions and velocities mean something to a protocol that
         # looks at them; nobody avoids anybody.
         self._phase = np.random.default_rng(config.seed + 1).uniform(0.0, 2.0 * np.pi, config.agents)
@@ -120,7 +112,7 @@ class Experiment:
         self.outcome = Outcome()
         self.slot = 0
         self._waiting: list[Wait] = []
-        self._events: dict[int, list[Event]] = {}
+        self._events: dict[int, list[FlightEvent]] = {}
         for event in events:
             self._events.setdefault(event.slot, []).append(event)
         if config.policy_row.agent_state:
@@ -136,10 +128,9 @@ class Experiment:
     def _go(self, agent: int) -> None:
         self.swarm.goal[0, agent - 1] = FAR
         self.moving[agent - 1] = True
-        self.moving_since[agent - 1] = self.slot
 
-    def happen(self, event: Event) -> None:
-        """Lets an event happen now."""
+    def happen(self, event: FlightEvent) -> None:
+        """Let an event happen now."""
         swarm, k = self.swarm, event.agent - 1
         if event.kind == "go" and not self.moving[k]:
             self._go(event.agent)
@@ -162,7 +153,7 @@ class Experiment:
             self._waiting = [wait for wait in self._waiting if wait.agent != event.agent]
             self._wait(event)
 
-    def _wait(self, event: Event) -> None:
+    def _wait(self, event: FlightEvent) -> None:
         wait = Wait(event.agent, event.kind, self.slot)
         self._waiting.append(wait)
         self.outcome.waits.append(wait)
@@ -199,7 +190,7 @@ class Experiment:
         if slot >= self.warmup:
             self._ages()
         if self._waiting:
-            self._look_at_waiting(ids if len(ids) == 1 else ())
+            self._check_waiting(ids if len(ids) == 1 else ())
         self.slot += 1
         return ids
 
@@ -222,11 +213,8 @@ class Experiment:
         believed = heard & (swarm.in_ap[:, movers] > 0)
         out.age_sum += int((self.slot - sent)[believed].sum())
         out.age_count += int(np.count_nonzero(believed))
-        since = np.maximum(sent, self.moving_since[movers])
-        out.true_sum += int((self.slot - since)[heard].sum())
-        out.true_count += int(np.count_nonzero(heard))
 
-    def _look_at_waiting(self, ids: tuple[int, ...]) -> None:
+    def _check_waiting(self, ids: tuple[int, ...]) -> None:
         swarm = self.swarm
         for wait in self._waiting:
             if wait.first < 0 and wait.agent in ids:

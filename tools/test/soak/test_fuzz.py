@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dtsa_dev.proofs.fuzz import TARGETS, build, fuzz
-from dtsa_dev.proofs.library import NotHere
+from dtsa_dev.proofs.programs import TARGETS, NotHere, build, fuzz
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(900)]
 SECONDS = {"frames": 120.0, "agents": 420.0, "station": 60.0}  # of one share: an hour in all

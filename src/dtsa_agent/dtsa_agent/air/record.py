@@ -8,7 +8,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from dtsa_agent.core.agents.delays import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.station import STATES
 from dtsa_agent.core.swarm import Floats
 

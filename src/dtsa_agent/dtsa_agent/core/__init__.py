@@ -1,6 +1,6 @@
 """The protocol and flight logic of DTSA: no ROS, no clock, no I/O."""
 
-from dtsa_agent.core.agents.agent import Agent, AgentGroup, Decision
+from dtsa_agent.core.agent import Agent, AgentGroup, Decision
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import Scenario, make_scenario, plug_in_random
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
+
+UNKNOWN = "one of the settings "  # what is allowed begins with it where no setting has the name of the field
 _LONGEST = 120  # characters of a value that an error repeats
 
 
@@ -12,17 +16,32 @@ class DtsaError(Exception):
 def shown(value: object) -> str:
     """A value as errors repeat it: not too long, whatever its own ``__repr__`` does."""
     try:
-        given = repr(value)
+        text = repr(value)
     except Exception:
-        given = f"<{type(value).__name__}>"
-    return given if len(given) <= _LONGEST else given[:_LONGEST] + " ..."
+        text = f"<{type(value).__name__}>"
+    return text if len(text) <= _LONGEST else text[:_LONGEST] + " ..."
+
+
+def did_you_mean(word: str, words: Iterable[str]) -> str:
+    """A question that names the nearest of the words that would have been right; empty if none is near."""
+    import difflib  # an agent in flight needs none
+
+    near = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
+    return f"; did you mean {near[0]}?" if near and near[0] != word else ""
 
 
 class ConfigError(DtsaError, ValueError):
-    """A setting, as the user wrote it, is not usable; ``allowed`` says in words what would have been."""
+    """A setting, as the user wrote it, is not usable.
+
+    ``allowed`` says in words what would have been; where it lists names, the nearest one is asked for.
+    """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
-        super().__init__(f"{field}: got {shown(value)}; allowed: {allowed}")
+        given = value[:_LONGEST] if isinstance(value, str) else ""
+        wrong = field.rpartition(".")[2] if allowed.startswith(UNKNOWN) else given
+        listed = re.split(r"\s*[,;]\s*|\s+or\s+", allowed.removeprefix(UNKNOWN))
+        near = did_you_mean(wrong, [word for word in listed if re.fullmatch(r"[A-Za-z][\w.-]*", word)])
+        super().__init__(f"{field}: got {shown(value)}; allowed: {allowed}{near}")
         self.field, self.value, self.allowed = field, value, allowed
 
     def __reduce__(self) -> tuple[type[ConfigError], tuple[str, object, str]]:

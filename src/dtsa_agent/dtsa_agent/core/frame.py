@@ -197,5 +197,5 @@ def named_in(data: bytes) -> tuple[int, int] | None:
 
 def condition_in(data: bytes) -> tuple[bool, bool, bool]:
     """Whether a frame's sender leaves, rests, is on probation; extended frames alone say the first and the last."""
-    found = lib.frame_condition_of(data)
-    return bool(found.leaves), bool(found.rests), bool(found.on_probation)
+    condition = lib.frame_condition_of(data)
+    return bool(condition.leaves), bool(condition.rests), bool(condition.on_probation)

@@ -127,7 +127,7 @@ class Registry(Generic[Row]):
         return self._plug_in(name)[0]
 
     def register(self, name: str, factory: Any) -> None:
-        """Makes a plug-in known to this process, under a name that no built-in row has; an older one is replaced."""
+        """Make a plug-in known to this process, under a name that no built-in row has; an older one is replaced."""
         if not isinstance(name, str) or not name or name in self.rows:
             raise ConfigError(self.kind, name, f"another name: {', '.join(self.rows)} are built in")
         if not callable(factory):

@@ -35,7 +35,6 @@ STATES = ("listening", "alone", "joined")
 FLIES, LISTENS, IS_NEW, SAME_ID, NO_QUORUM = range(5)  # why an agent hovers
 ALL_BUT_ONE = "all-but-one"
 QUORUMS = f"{ALL_BUT_ONE}, a share of the others (80%), or a number of them (0: it never hovers for this)"
-FOR_EVER = 1 << 31  # slots
 KEEPS_NOTHING, KEEPS_NUMBERS, KEEPS_STARTS = range(3)  # slots move as the rules say; with frames that fit; never
 BETWEEN = lib.DTSA_BETWEEN / 1000  # of a slot, between a frame that left late and the next slot
 EARLY_COUNT = 64  # frames of slots still to come that are kept
@@ -121,15 +120,6 @@ def parse_quorum(text: str) -> tuple[int, float]:
     raise ConfigError("quorum", text, QUORUMS)
 
 
-def _limits(config: SwarmConfig) -> tuple[int, int]:
-    """Slots after which an agent counts as silent: one that moves, one that rests; 0: what libdtsa says."""
-    row, round_ = config.policy_row, config.agents
-    turn = max(2 * config.heard_every * round_, round(0.5 / config.slot_s))
-    if "received" in row.port and not row.extended:  # agents send by chance, and those that have arrived need not
-        return max(turn, 6 * config.main_every * round_), FOR_EVER
-    return (0, 0) if row.extended else (turn, turn)
-
-
 class StationSettings:
     """The settings of a station as C has them; they also read and write datagrams.
 
@@ -158,7 +148,7 @@ class StationSettings:
         number, share = parse_quorum(quorum)
         if number >= config.agents:
             raise ConfigError("quorum", quorum, f"at most {config.agents - 1}, the number of the others")
-        moving, resting = _limits(config)
+        by_chance = lib.DTSA_SENDS_BY_CHANCE if "received" in config.policy_row.port else lib.DTSA_SENDS_IN_TURNS
         self._key = ffi.new("uint8_t[]", key)
         begins = lib.DTSA_BEGINS_LATE if listens else lib.DTSA_BEGINS_TOGETHER
         if origin_ns is None:
@@ -167,12 +157,13 @@ class StationSettings:
         lease = {"anchor_every": config.anchor_every, "main_every": config.main_every, "open_every": config.open_period}
         cycle = lib.dtsa_slot_cycle(ffi.new("dtsa_config *", {"agents": config.agents, "lease": lease}))
         self.c = ffi.new("dtsa_station_settings *", {
-            "id": id, "agents": config.agents, "anchor_every": config.heard_every,
-            "main_every": config.main_every if rests else config.heard_every, "slot_cycle": cycle,
+            "id": id, "agents": config.agents, "anchor_every": config.turn_every,
+            "main_every": config.main_every if rests else config.turn_every, "slot_cycle": cycle,
             "extended": config.extended, "own_bytes": config.own_bytes,
             "frame_length": config.frame_length - (TAG_LENGTH if config.auth else 0),
             "position_step": position_step(config.extent_m), "slot_ns": config.slot_ns, "seed": config.seed,
-            "moving_slots": moving, "resting_slots": resting, "quorum": number, "quorum_share": share,
+            "sends": lib.DTSA_SENDS_IN_ANCHORS if config.policy_row.extended else by_chance,
+            "quorum": number, "quorum_share": share,
             "key": self._key if key else ffi.NULL, "key_length": len(key), "session": session,
             "early_count": EARLY_COUNT, "begins": begins, "origin_ns": origin_ns or 0,
             "keeps_time": keeps_time, "equal_tables": not config.policy_row.may_join,
@@ -191,14 +182,14 @@ class StationSettings:
         verdict = lib.dtsa_datagram_read(self.c, data, len(data), out)
         if verdict:
             return ParsedDatagram(VERDICTS[verdict])
-        names = tuple(Named(one.id, one.late_ns) for one in list(out.names)[: self.names] if one.id)
+        names = tuple(Named(entry.id, entry.late_ns) for entry in list(out.names)[: self.names] if entry.id)
         frame = bytes(ffi.buffer(out.frame, out.frame_length))
         return ParsedDatagram("", out.sender, out.slot, out.late_ns, names, frame)
 
     def hears(self, names: tuple[Named, ...], agent: int) -> bool | None:
         """Whether the sender of a datagram with these names hears an agent; None: it does not say."""
-        told: int = lib.dtsa_names_hear(ffi.new("dtsa_named[]", list(names)), len(names), self.names, agent)
-        return told > 0 if told else None
+        answer: int = lib.dtsa_names_hear(ffi.new("dtsa_named[]", list(names)), len(names), self.names, agent)
+        return answer > 0 if answer else None
 
     def write(self, frame: bytes, slot: int, late_ns: int = 0, names: tuple[tuple[int, int], ...] = ()) -> bytes:
         """The datagram of a frame that carries no tag yet.

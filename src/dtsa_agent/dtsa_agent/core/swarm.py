@@ -142,7 +142,7 @@ class Swarm:
             "n": config.agents, "v": len(tables), "l": count, "s": steps, "f": FRAME_MAX,
             "p": lib.swarm_policy_bytes(ffi.addressof(kernel, "config")),
         }  # fmt: skip
-        self._lend(kernel, sizes)
+        self._share_arrays(kernel, sizes)
         self.local[:], self.observer[:], self.final[:] = np.array(self.ids) - 1, np.array(tables) - 1, 1
         self.known_goal[:] = self.scenario.target
         self.rows = np.arange(count)  # (L,) table of each local agent, unless shared
@@ -183,29 +183,29 @@ class Swarm:
             decay=memory(self._decay), decay_len=DECAY_STEPS,
         )  # fmt: skip
 
-    def _lend(self, kernel: Any, sizes: dict[str, int]) -> None:
+    def _share_arrays(self, kernel: Any, sizes: dict[str, int]) -> None:
         """Make the arrays and lend them to C."""
-        self._lent = []
+        self._borrowed = []
         for name, letters in _SHAPES.items():
             shape = tuple(sizes[letter] if letter in sizes else int(letter) for letter in letters)
             array = np.zeros(shape, _ITEMS[name])
-            self._lent.append(memory(array, writable=True))
+            self._borrowed.append(memory(array, writable=True))
             setattr(self, name, array)
-            setattr(kernel, name, self._lent[-1])
+            setattr(kernel, name, self._borrowed[-1])
         self._senders, self._lengths = self.senders.data, self.frame_length.data
         self._frames: list[memoryview] = [row.data for row in self.frames]
 
     def decide(self, slot: int) -> None:
-        """Fills ``chosen``, ``reason``, ``score``, ``digest`` and ``sends`` from what was heard before the slot."""
+        """Fill ``chosen``, ``reason``, ``score``, ``digest`` and ``sends`` from what was heard before the slot."""
         lib.swarm_decide(self.kernel, slot)
 
     def emit(self, slot: int) -> tuple[int, ...]:
-        """Encodes the frames of all local agents whose ``sends`` is set; returns their positions in ``ids``."""
+        """Encode the frames of all local agents whose ``sends`` is set; returns their positions in ``ids``."""
         self._slot = slot
         return tuple(self._senders[: lib.swarm_emit(self.kernel, slot)])
 
     def begin(self, slot: int) -> tuple[int, ...]:
-        """Decides who sends in a slot, and encodes the frames; returns the positions in ``ids`` of those that send."""
+        """Decide who sends in a slot, and encode the frames; returns the positions in ``ids`` of those that send."""
         self._slot = slot
         count = _begin(self.kernel, slot)
         return (self._senders[0],) if count == 1 else tuple(self._senders[:count])
@@ -249,15 +249,15 @@ class Swarm:
         _fly(self.kernel, slot, 0)
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
-        """Fills ``command`` for one control instant, 0 .. steps; ``estimate``: whether to fill the estimates first."""
+        """Fill ``command`` for one control instant, 0 .. steps; ``estimate``: whether to fill the estimates first."""
         lib.swarm_steer(self.kernel, slot, self._instant(step), estimate)
 
     def move(self, step: int) -> None:
-        """Moves the simulated vehicles on by one control period and notes ``track``; step: 0 .. steps - 1."""
+        """Move the simulated vehicles on by one control period and note ``track``; step: 0 .. steps - 1."""
         lib.swarm_move(self.kernel, self._instant(step, last=False))
 
     def estimate(self, slot: int, step: int = 0) -> None:
-        """Fills ``estimate_position`` and ``estimate_velocity`` of all tables (eq:estimate); step: 0 .. steps."""
+        """Fill ``estimate_position`` and ``estimate_velocity`` of all tables (eq:estimate); step: 0 .. steps."""
         lib.swarm_estimate_all(self.kernel, slot, self._instant(step))
 
     def observations(self, slot: int, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
@@ -276,7 +276,7 @@ class Swarm:
         return step
 
     def hear(self, slot: int, data: bytes, mask: Bytes | None = None) -> bool:
-        """Takes in what the air carried in a slot; returns whether it was a frame of this swarm and this time.
+        """Receive what the air carried in a slot; returns whether it was a frame of this swarm and this time.
 
         :param data: malformed, foreign and forged frames are counted and change nothing.
         :param mask: (V,) which tables hear it; None: all.
@@ -293,7 +293,7 @@ class Swarm:
         return bool(_hear(self.kernel, slot, bytes(frame), len(frame), tables))
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
-        """Closes a slot after all that was heard in it: counters, silence, and the senders' entries for themselves.
+        """Close a slot after all that was heard in it: counters, silence, and the senders' entries for themselves.
 
         :param collided: (V,) which receivers noticed a collision; None: they cannot tell it from silence.
         """

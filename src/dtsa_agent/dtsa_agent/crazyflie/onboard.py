@@ -85,7 +85,7 @@ def app_parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dic
         "estimator": ESTIMATORS.index(swarm.estimator),
         "header": int.from_bytes(header_of(swarm, PORT) or b"\0\0", "little"), "steps": swarm.steps,
         # In this slot all begin together with a policy that no agent can join.
-        "beginSlot": 0 if swarm.policy_row.may_join else 4 * swarm.heard_every * swarm.agents,
+        "beginSlot": 0 if swarm.policy_row.may_join else 4 * swarm.turn_every * swarm.agents,
         "goalsKnown": swarm.targets_known,
         "slotUs": swarm.slot_ns // 1000, "flightUs": FLIGHT_US, "seed": swarm.seed, "height": height,
     }  # fmt: skip

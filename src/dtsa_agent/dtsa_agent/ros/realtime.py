@@ -40,7 +40,7 @@ from rclpy.qos import QoSProfile
 
 from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig, make_scenario
-from dtsa_agent.core.agents.agent import REFUSED
+from dtsa_agent.core.agent import REFUSED
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator

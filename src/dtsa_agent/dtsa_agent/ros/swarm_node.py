@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from dtsa_agent.core import AgentGroup, Swarm
-from dtsa_agent.core.agents.agent import REFUSED
+from dtsa_agent.core.agent import REFUSED
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings
 from dtsa_agent.ros.common import names

@@ -13,7 +13,7 @@ from dtsa_agent.core.frame import OPEN, ExtendedFrame, Frame, Gossip, decode_ext
 from dtsa_agent.core.reference.lease.decide import takes_open
 from dtsa_agent.core.reference.lease.issue import open_block
 from dtsa_agent.core.reference.lease.memory import Memory
-from dtsa_agent.core.reference.rules import Rules
+from dtsa_agent.core.reference.table import Rules
 
 OWN = {"position": (0.0, 0.0, 0.0), "velocity": (0.0, 0.0, 0.0), "intent": (0.0, 0.0, 0.0)}
 

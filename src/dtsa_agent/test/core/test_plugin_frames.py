@@ -11,7 +11,7 @@ import pytest
 from dtsa_agent.core import Agent, ConfigError, PluginError, SlotOutcome, Swarm, SwarmConfig
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.core.plugins.table import Table
+from dtsa_agent.core.plugins.kinds import Table
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES
 
 KEY = bytes(range(16))
@@ -77,7 +77,7 @@ def config(**settings: Any) -> SwarmConfig:
 
 
 def parts(swarm: Swarm, kind: str) -> list[Any]:
-    return [part.made for part in getattr(swarm, kind)]
+    return [part.instance for part in getattr(swarm, kind)]
 
 
 def fly(swarm: Swarm, slots: range, lost: tuple[int, int] | None = None) -> list[bytes]:

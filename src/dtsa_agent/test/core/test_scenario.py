@@ -172,7 +172,7 @@ def test_stop_and_go_shuttles_and_ends_where_the_number_of_legs_leads() -> None:
         assert np.array_equal(made.target, made.start) == home
         assert made.plan is not None
         line = np.linalg.norm(made.plan.goals[0] - made.start, axis=0)
-        assert np.allclose(made.plan.way, (stops + 1) * line)
+        assert np.allclose(made.plan.path_length, (stops + 1) * line)
 
 
 def plan(legs: int, begin: int = 0, pause: int = 0) -> Plan:

@@ -15,8 +15,7 @@ from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference import station as reference
 from dtsa_agent.core.reference.agent import Agent
-from dtsa_agent.core.reference.rules import Rules
-from dtsa_agent.core.reference.table import Table
+from dtsa_agent.core.reference.table import Rules, Table
 from dtsa_agent.core.station import FLIES, STATES, VERDICTS, Link, Named, Station, StationSettings
 
 MS = 1_000_000

@@ -1,13 +1,8 @@
-"""The command line: finds the module of a command, imports that one alone, and turns errors into one line.
-
-A command is a module `dtsa_bench.commands.<name>` with all that concerns it: `DESCRIPTION`, `EXAMPLES` (words, and what
-they do), `add_arguments(parser)` and `run(args) -> int`.
-"""
+"""The command line: imports the chosen command's module alone, and turns errors into one line."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 import re
 import signal
@@ -18,26 +13,25 @@ from typing import Any, NoReturn
 from dtsa_bench import __version__
 from dtsa_bench.runs.program import program
 
-from .missing_packages import say_missing
-from .registry import COMMANDS, hint, module_of
+from .registry import COMMANDS, Command, hint, load_command, report_missing_package
 
 PROGRAM = "dtsa"
 INTERRUPTED = 128 + signal.SIGINT
 
 
 class HelpText(argparse.HelpFormatter):
-    """Fills paragraphs, but leaves examples as they are."""
+    """Fill paragraphs, but leave examples as they are."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return text if text.startswith("examples:") else super()._fill_text(text, width, indent)
 
 
-class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage text around it; takes no abbreviations."""
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose errors are one line, without the usage text; it takes no abbreviations."""
 
     def __init__(self, **more: Any) -> None:
         super().__init__(allow_abbrev=False, formatter_class=HelpText, **more)
-        self.commands: dict[str, OneLineParser] = {}  # parsers of the commands, of the whole command line's parser
+        self.commands: dict[str, CommandParser] = {}  # parsers of the commands, of the whole command line's parser
 
     def error(self, message: str) -> NoReturn:
         wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
@@ -46,40 +40,40 @@ class OneLineParser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does; an option that there is not is named before one that is missing."""
-        known = self._option_string_actions
+        options = self._option_string_actions
         for word in () if self._subparsers else args or ():
             option = word.partition("=")[0]
-            if option.startswith("--") and option not in (*known, "--"):
-                self.error(f"option {word}: unknown{hint(option, known)}")
+            if option.startswith("--") and option not in (*options, "--"):
+                self.error(f"option {word}: unknown{hint(option, options)}")
         return super().parse_known_args(args, namespace)
 
 
-def build_parser(command: str | None, others: Sequence[str] = ()) -> tuple[OneLineParser, Any]:
+def build_parser(command: str | None, others: Sequence[str] = ()) -> tuple[CommandParser, Command | None]:
     """Parser of the whole command line; only the chosen command's module is imported.
 
     :param command: first word of the command line, None if there is none.
-    :returns: the parser, and the chosen command's module or None.
+    :returns: the parser, and the chosen command or None.
     """
-    parser = OneLineParser(prog=PROGRAM, description="Channel access in quadcopter swarms.")
+    parser = CommandParser(prog=PROGRAM, description="Channel access in quadcopter swarms.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     subparsers = parser.add_subparsers(
-        dest="command", metavar="COMMAND", required=True, parser_class=OneLineParser, title="commands"
+        dest="command", metavar="COMMAND", required=True, parser_class=CommandParser, title="commands"
     )
     chosen = None
     for name, text in {**COMMANDS, **dict.fromkeys(others, "")}.items():
         parser.commands[name] = subparsers.add_parser(name, help=text)
         if name == command:
-            chosen = importlib.import_module(module_of(name))
-            declare(chosen, parser.commands[name], name)
+            chosen = load_command(name)
+            add_command(chosen, parser.commands[name], name)
     return parser, chosen
 
 
-def declare(module: Any, parser: OneLineParser, name: str) -> None:
-    """Fills the parser of a command with what its module says."""
-    parser.description = module.DESCRIPTION
-    lines = [f"  {program()} {name} {words}".rstrip() + f"\n      {text}" for words, text in module.EXAMPLES]
+def add_command(command: Command, parser: CommandParser, name: str) -> None:
+    """Fill the parser of a command."""
+    parser.description = command.description
+    lines = [f"  {program()} {name} {words}".rstrip() + f"\n      {text}" for words, text in command.examples]
     parser.epilog = "\n".join(["examples:", *lines])
-    module.add_arguments(parser)
+    command.add_arguments(parser)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -106,29 +100,26 @@ def _run(words: Sequence[str]) -> int:
     args, surplus = parser.parse_known_args(words)
     if surplus:
         parser.error(f"argument {surplus[0]}: unknown")
-    return int(chosen.run(args) or 0)
+    assert chosen is not None
+    return chosen.run(args)
 
 
 def report(error: Exception) -> int:
     """Print an error that was raised on purpose, or by the system, as one line; pass on all others."""
     if isinstance(error, ImportError):
-        return say_missing(PROGRAM, error)
+        return report_missing_package(PROGRAM, error)
     if isinstance(error, OSError):
         return _report_system(error)
     from dtsa_agent.core.errors import ConfigError, DtsaError
 
     if not isinstance(error, DtsaError):
         raise error
-    near = ""
-    if isinstance(error, ConfigError):
-        words = re.split(r"\s*[,;]\s*|\s+or\s+", error.allowed)
-        near = hint(str(error.value), [word for word in words if re.fullmatch(r"[A-Za-z][\w.-]*", word)])
-    print(f"{PROGRAM}: error: {' '.join(str(error).split())}{near}", file=sys.stderr)
+    print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
     return 2 if isinstance(error, ConfigError) else 1
 
 
 def _report_system(error: OSError) -> int:
-    """Says what the system refused; where standard output takes nothing more, not even the exit writes to it again."""
+    """Report what the system refused; where standard output takes no more, not even the exit writes to it."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -141,5 +132,32 @@ def _report_system(error: OSError) -> int:
     return 1
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+# What `tools/dtsa` knows besides the commands of this package; a test compares.
+CHECKOUT_COMMANDS = ("setup", "shell", "test", "ros2", "clean")
+
+
+class CompletionCommand(Command):
+    description = """\
+Prints a script for bash or zsh that completes the commands of this program, their options, and the values of
+options that have names. It asks nobody while one types; after an update it is made again."""
+    examples = (
+        ("bash > ~/.dtsa-completion.bash", "then, in ~/.bashrc: . ~/.dtsa-completion.bash"),
+        ("zsh > ~/.zsh/_dtsa", "then, in ~/.zshrc before compinit: fpath=(~/.zsh $fpath)"),
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("shell", choices=("bash", "zsh"), help="for which shell")
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Print the script."""
+        import shtab
+
+        parser, _ = build_parser(None, CHECKOUT_COMMANDS)
+        for name in COMMANDS:
+            own = parser.commands[name]
+            add_command(load_command(name), own, name)
+            own.description = COMMANDS[name]
+            for action in own._actions:
+                action.choices = action.choices or getattr(action, "words", None) or None
+        print(shtab.complete(parser, args.shell))
+        return 0

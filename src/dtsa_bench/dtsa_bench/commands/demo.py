@@ -16,54 +16,61 @@ from typing import TYPE_CHECKING, Any
 from dtsa_bench.runs.options import new_directory, whole_number
 from dtsa_bench.runs.program import program
 
+from .registry import Command
+
 if TYPE_CHECKING:
     from dtsa_bench.pages.demo.flights import FinishedFlight
 
-INTERRUPTED = 130
-NUMBERS = "demo.json"
-_REMOTE = ("SSH_CONNECTION", "SSH_CLIENT", "SSH_TTY", "CI")
 
-
-DESCRIPTION = """\
+class DemoCommand(Command):
+    description = """\
 Nine flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a channel that quadcopters
 share, and what goes wrong when messages are lost. One picture shows them all. The first eight, which are the same on
 every machine, stand side by side on a page; in the last one, in real time, a process is killed and comes back."""
-EXAMPLES = (
-    ("", "everything, into runs/demo-1, and the page in a browser"),
-    ("--animation --no-open --out story", "with a moving picture; no browser"),
-)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the command's options."""
-    parser.add_argument(
-        "--out", metavar="DIR", default=None, help="new directory for everything [runs/demo-1, -2, ...]"
-    )
-    parser.add_argument("--seed", metavar="N", default="1", help="seed of the flights [1]")
-    parser.add_argument(
-        "--animation", action="store_true", help="make demo.gif, too, a moving picture of steps 2 and 3"
-    )
-    parser.add_argument("--json", action="store_true", help="print demo.json; everything else goes to standard error")
-    parser.add_argument(
-        "--open",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="open the page in a browser [where there is a display, but not over ssh or in CI]",
+    examples = (
+        ("", "everything, into runs/demo-1, and the page in a browser"),
+        ("--animation --no-open --out story", "with a moving picture; no browser"),
     )
 
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument(
+            "--out", metavar="DIR", default=None, help="new directory for everything [runs/demo-1, -2, ...]"
+        )
+        parser.add_argument("--seed", metavar="N", default="1", help="seed of the flights [1]")
+        parser.add_argument(
+            "--animation", action="store_true", help="make demo.gif, too, a moving picture of steps 2 and 3"
+        )
+        parser.add_argument(
+            "--json", action="store_true", help="print demo.json; everything else goes to standard error"
+        )
+        parser.add_argument(
+            "--open",
+            action=argparse.BooleanOptionalAction,
+            default=None,
+            help="open the page in a browser [where there is a display, but not over ssh or in CI]",
+        )
 
-def run(args: argparse.Namespace) -> int:
-    """Flies, checks, draws.
+    def run(self, args: argparse.Namespace) -> int:
+        """Flies, checks, draws.
 
-    :returns: 0; 1 if a bag's check failed; 130 when interrupted.
-    """
-    if args.json:
-        with redirect_stdout(sys.stderr):
-            code, directory = _run(args)
-        if code != INTERRUPTED:
-            print((directory / NUMBERS).read_text(encoding="utf-8"), end="")
-        return code
-    return _run(args)[0]
+        :returns: 0; 1 if a bag's check failed; 130 when interrupted.
+        """
+        if args.json:
+            with redirect_stdout(sys.stderr):
+                code, directory = _run(args)
+            if code != INTERRUPTED:
+                print((directory / NUMBERS).read_text(encoding="utf-8"), end="")
+            return code
+        return _run(args)[0]
+
+
+INTERRUPTED = 130
+
+
+NUMBERS = "demo.json"
+
+
+_REMOTE = ("SSH_CONNECTION", "SSH_CLIENT", "SSH_TTY", "CI")
 
 
 def _run(args: argparse.Namespace) -> tuple[int, Path]:

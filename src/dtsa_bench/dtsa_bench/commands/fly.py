@@ -24,63 +24,129 @@ from dtsa_bench.runs.options import (
     whole_number,
 )
 
-from .bridge import add_simulated_radio, use_simulated_radio
+from .crazyflies import add_simulated_radio, use_simulated_radio
+from .registry import Command
 
 if TYPE_CHECKING:
     from dtsa_bench.pages.view.process import PageOptions
 
-INTERRUPTED = 130
-LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
-_LATER = ("respawn",)  # options of a flight that concern real time alone
 
-DESCRIPTION = """\
+class FlyCommand(Command):
+    description = """\
 Starts the channel and the agents as ROS 2 nodes, records the flight, and ends them all."""
-EXAMPLES = (
-    ("--out runs/a", "twelve agents, a process each, as in the paper"),
-    ("--out runs/b --agents 18 --policy lease --loss 0.1 --processes 2", "lost frames, two processes"),
-    ("--out runs/c --mode realtime --policy lease --respawn 1", "clocks of their own; the dead come back"),
-    ("--out runs/e --mode realtime --policy lease --view --control", "in a browser, which may kill agents and jam"),
-    ("--out runs/d --backend cflib --config swarm.yaml", "Crazyflies"),
-)
+    examples = (
+        ("--out runs/a", "twelve agents, a process each, as in the paper"),
+        ("--out runs/b --agents 18 --policy lease --loss 0.1 --processes 2", "lost frames, two processes"),
+        ("--out runs/c --mode realtime --policy lease --respawn 1", "clocks of their own; the dead come back"),
+        ("--out runs/e --mode realtime --policy lease --view --control", "in a browser, which may kill agents and jam"),
+        ("--out runs/d --backend cflib --config swarm.yaml", "Crazyflies"),
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.usage = "%(prog)s --out DIR [OPTIONS]"
+        group = parser.add_argument_group("the flight")
+        group.add_argument(
+            "--out", metavar="DIR", required=True, help="new directory for the bag, summary.json and trajectories.png"
+        )
+        group.add_argument(
+            "--processes",
+            metavar="per-agent|K",
+            default="per-agent",
+            help="one process an agent, or all agents in K processes [per-agent]",
+        )
+        group.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the flight [a free one]")
+        group.add_argument(
+            "--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png"
+        )
+        group.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+        group.add_argument(
+            "--view", action="store_true", help="show the flight in a browser on this machine, see docs/how-to/view.md"
+        )
+        group.add_argument("--view-port", metavar="N", default=None, help="port of the page [a free one]")
+        group.add_argument(
+            "--control",
+            action="store_true",
+            help="the page may kill and start agents and change the channel; land and stop Crazyflies",
+        )
+        add_options(group, FlightOptions, "flight", skip=(*_LATER, "startup_s", "processes", "domain", "pictures"))
+        _add_crazyflie_options(parser)
+        add_run_options(parser)
+        clocks = add_mode_options(parser)
+        kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
+        add_options(clocks, FlightOptions, "flight", skip=kept)
+        clocks.add_argument(
+            "--late",
+            metavar="cfK=S,...",
+            default=None,
+            help="real time: agents whose processes are started S seconds after slot 0 only [none]",
+        )
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Flies; 1 when the flight was cut short or its agents did not hear each other, 130 when it was interrupted."""
+        if args.backend == "cflib":
+            return run_crazyflies(args)
+        config = run_config(args)
+        from dtsa_agent.core.errors import ConfigError
+
+        if args.config is not None:
+            raise ConfigError("config", args.config, "a swarm.yaml together with --backend cflib")
+        domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
+        directory = Path(args.out)
+
+        from dtsa_bench.flights.domain import clear_hindrances
+
+        clear_hindrances(os.environ)
+        from dtsa_agent.stop import Stop
+        from dtsa_bench.flights.flight import fly
+        from dtsa_bench.flights.options import process_count
+
+        options = FlightOptions(
+            processes=process_count(args.processes, config.swarm.agents),
+            domain=domain,
+            pictures=args.picture,
+            late=late_agents(args.late),
+            **given_options(args, FlightOptions, "flight"),
+        )
+        page = page_options(args)
+        with Stop(LONGEST_END_S) as stop, ExitStack() as pages:
+            process = None
+
+            def show(domain: int, environment: Mapping[str, str]) -> None:
+                nonlocal process
+                from dtsa_bench.pages.view.process import view_process
+
+                if page is not None:
+                    process = pages.enter_context(view_process(domain, environment, page))
+
+            flight = fly(config, directory, options, stop, on_domain=show)
+            interrupted = bool(stop)
+            _print_result(args, flight)
+            picture = directory / "trajectories.png"
+            if not args.json and picture.exists():
+                print(f"picture: {picture}", flush=True)
+            if process is not None and sys.stdin.isatty() and not stop:
+                print("the flight is over; the page stays until Ctrl-C", file=sys.stderr, flush=True)
+                while not stop and process.poll() is None:
+                    time.sleep(0.1)
+        if flight.summary.get("warning"):
+            print(f"dtsa: warning: {flight.summary['warning']}", file=sys.stderr)
+        cut_short = flight.summary.get("cut_short")
+        if interrupted:
+            print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
+            _report_missing_frames(flight.summary)
+            return INTERRUPTED
+        if cut_short:
+            print(f"dtsa: the flight was cut short: {cut_short}", file=sys.stderr)
+        return 1 if _report_missing_frames(flight.summary) or cut_short else 0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the command's options."""
-    parser.usage = "%(prog)s --out DIR [OPTIONS]"
-    group = parser.add_argument_group("the flight")
-    group.add_argument(
-        "--out", metavar="DIR", required=True, help="new directory for the bag, summary.json and trajectories.png"
-    )
-    group.add_argument(
-        "--processes",
-        metavar="per-agent|K",
-        default="per-agent",
-        help="one process an agent, or all agents in K processes [per-agent]",
-    )
-    group.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the flight [a free one]")
-    group.add_argument("--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png")
-    group.add_argument("--json", action="store_true", help="print summary.json instead of lines")
-    group.add_argument(
-        "--view", action="store_true", help="show the flight in a browser on this machine, see docs/how-to/view.md"
-    )
-    group.add_argument("--view-port", metavar="N", default=None, help="port of the page [a free one]")
-    group.add_argument(
-        "--control",
-        action="store_true",
-        help="the page may kill and start agents and change the channel; land and stop Crazyflies",
-    )
-    add_options(group, FlightOptions, "flight", skip=(*_LATER, "startup_s", "processes", "domain", "pictures"))
-    _add_crazyflie_options(parser)
-    add_run_options(parser)
-    clocks = add_mode_options(parser)
-    kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
-    add_options(clocks, FlightOptions, "flight", skip=kept)
-    clocks.add_argument(
-        "--late",
-        metavar="cfK=S,...",
-        default=None,
-        help="real time: agents whose processes are started S seconds after slot 0 only [none]",
-    )
+INTERRUPTED = 130
+
+
+LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
+
+
+_LATER = ("respawn",)  # options of a flight that concern real time alone
 
 
 def _add_crazyflie_options(parser: argparse.ArgumentParser) -> None:
@@ -103,65 +169,6 @@ def _add_crazyflie_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Flies; 1 when the flight was cut short or its agents did not hear each other, 130 when it was interrupted."""
-    if args.backend == "cflib":
-        return run_crazyflies(args)
-    config = run_config(args)
-    from dtsa_agent.core.errors import ConfigError
-
-    if args.config is not None:
-        raise ConfigError("config", args.config, "a swarm.yaml together with --backend cflib")
-    domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
-    directory = Path(args.out)
-
-    from dtsa_bench.flights.domain import clear_hindrances
-
-    clear_hindrances(os.environ)
-    from dtsa_agent.stop import Stop
-    from dtsa_bench.flights.flight import fly
-    from dtsa_bench.flights.options import process_count
-
-    options = FlightOptions(
-        processes=process_count(args.processes, config.swarm.agents),
-        domain=domain,
-        pictures=args.picture,
-        late=late_agents(args.late),
-        **given_options(args, FlightOptions, "flight"),
-    )
-    page = page_options(args)
-    with Stop(LONGEST_END_S) as stop, ExitStack() as pages:
-        process = None
-
-        def show(domain: int, environment: Mapping[str, str]) -> None:
-            nonlocal process
-            from dtsa_bench.pages.view.process import view_process
-
-            if page is not None:
-                process = pages.enter_context(view_process(domain, environment, page))
-
-        flight = fly(config, directory, options, stop, on_domain=show)
-        interrupted = bool(stop)
-        _tell(args, flight)
-        picture = directory / "trajectories.png"
-        if not args.json and picture.exists():
-            print(f"picture: {picture}", flush=True)
-        if process is not None and sys.stdin.isatty() and not stop:
-            print("the flight is over; the page stays until Ctrl-C", file=sys.stderr, flush=True)
-            while not stop and process.poll() is None:
-                time.sleep(0.1)
-    if flight.summary.get("warning"):
-        print(f"dtsa: warning: {flight.summary['warning']}", file=sys.stderr)
-    cut_short = flight.summary.get("cut_short")
-    if interrupted:
-        print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
-        _unheard(flight.summary)
-        return INTERRUPTED
-    if cut_short:
-        print(f"dtsa: the flight was cut short: {cut_short}", file=sys.stderr)
-    return 1 if _unheard(flight.summary) or cut_short else 0
-
-
 def page_options(args: argparse.Namespace) -> PageOptions | None:
     """The page that is wanted; None: none is."""
     if not (args.view or args.view_port or args.control):
@@ -178,12 +185,12 @@ def late_agents(text: str | None) -> dict[int, float]:
     """
     late = {}
     for part in () if text is None else text.split(","):
-        found = re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part)
-        if not found:
+        match = re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part)
+        if not match:
             from dtsa_agent.core.errors import ConfigError
 
             raise ConfigError("late", text, "cfK=S,...: agents, and seconds after slot 0")
-        late[int(found[1])] = float(found[2])
+        late[int(match[1])] = float(match[2])
     return late
 
 
@@ -212,8 +219,8 @@ def run_crazyflies(args: argparse.Namespace) -> int:
         flight, cut_short = fly_crazyflies(
             config, settings, path, args.out, options, stop, attach=args.attach, page=page
         )
-    _tell(args, flight)
-    unheard = _unheard(flight.summary)
+    _print_result(args, flight)
+    unheard = _report_missing_frames(flight.summary)
     not_landed = [] if stop and not cut_short else flight.summary.get("not_landed", [])
     if problem := mission_problem(cut_short, not_landed):
         print(f"dtsa: {problem}", file=sys.stderr)
@@ -233,15 +240,15 @@ def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
     return f"{exchange}; {end}"
 
 
-def _unheard(summary: dict[str, Any]) -> bool:
-    """Says so if nobody has heard anybody, or most frames were of no use; whether it is so."""
+def _report_missing_frames(summary: dict[str, Any]) -> bool:
+    """Warn if no agent has heard another one, or most frames were of no use; whether it is so."""
     if summary["unheard"]:
         print(f"dtsa: {summary['unheard']}", file=sys.stderr)
     return bool(summary["unheard"])
 
 
-def _tell(args: argparse.Namespace, flight: Any) -> None:
-    """Prints what came of a flight."""
+def _print_result(args: argparse.Namespace, flight: Any) -> None:
+    """Print what came of a flight."""
     if args.json:
         print(json.dumps(flight.summary, indent=2))
         return

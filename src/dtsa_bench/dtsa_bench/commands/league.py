@@ -1,4 +1,4 @@
-"""`dtsa league`: frozen cells that any policy flies, entries that anybody can check, and the table of all."""
+"""`dtsa league` and `dtsa new-plugin`: frozen cells that any policy flies, and a policy of your own to begin with."""
 
 from __future__ import annotations
 
@@ -13,63 +13,68 @@ from typing import TYPE_CHECKING
 
 from dtsa_bench.runs.program import program
 
+from .registry import Command
+
 if TYPE_CHECKING:
     from dtsa_bench.experiments.league import League
 
-DESCRIPTION = """\
+
+class LeagueCommand(Command):
+    description = """\
 `cells` lists what is flown, and the schemes that come with this program. `enter POLICY` flies one of them, or a
 plug-in, through all cells and writes an entry. `check FILE` flies a sample of the flights of its entries again and says
 what differs. `table FILE...` compares entries. How to enter: docs/how-to/sweep.md."""
+    examples = (
+        ("cells", "what is flown, and the schemes that come with the package"),
+        ("enter lease --sample 2", "two seeds of each cell, to try it out"),
+        ("enter my-policy --path runs/plug-ins", "a plug-in that was installed into a directory, all cells"),
+        ("check docs/evidence/league-1.json lease", "flies a sample of its flights again"),
+        ("table runs/league-1/lease runs/league-1/tdma --out runs/table", "a table and a page"),
+    )
 
-EXAMPLES = (
-    ("cells", "what is flown, and the schemes that come with the package"),
-    ("enter lease --sample 2", "two seeds of each cell, to try it out"),
-    ("enter my-policy --path runs/plug-ins", "a plug-in that was installed into a directory, all cells"),
-    ("check docs/evidence/league-1.json lease", "flies a sample of its flights again"),
-    ("table runs/league-1/lease runs/league-1/tdma --out runs/table", "a table and a page"),
-)
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+        actions.add_parser("cells", help="list what is flown")
+        enter = actions.add_parser("enter", help="fly a policy through all cells")
+        enter.add_argument("policy", metavar="POLICY", help="a scheme of `league cells`, or a policy by its name")
+        enter.add_argument("--name", metavar="NAME", help="name of the entry [the scheme's]")
+        enter.add_argument(
+            "--set", metavar="NAME=VALUE", action="append", help="a setting of the policy, or frame=extended"
+        )
+        enter.add_argument("--cells", metavar="NAME[,NAME...]", help="these alone; the entry is incomplete")
+        enter.add_argument("--sample", metavar="N", help="so many seeds of each cell; the entry is incomplete")
+        enter.add_argument("--cluster", metavar="tcp://HOST:PORT", help="fly on a Dask cluster with this scheduler")
+        enter.add_argument("--out", metavar="DIR", help="directory for entry.json [runs/league-1/NAME]")
+        check = actions.add_parser("check", help="fly a sample of entries again")
+        check.add_argument("file", metavar="FILE", help="file of entries, or directory that `enter` wrote")
+        check.add_argument("names", metavar="NAME", nargs="*", help="which of its entries [all]")
+        check.add_argument("--sample", metavar="N", default=str(SAMPLE), help=f"so many flights of each [{SAMPLE}]")
+        check.add_argument("--all", action="store_true", help="all flights")
+        check.add_argument("--seed", metavar="N", help="which flights are flown again [at random]")
+        for action in (enter, check):
+            action.add_argument("--path", metavar="DIR", help="where Python also looks for installed plug-ins")
+            action.add_argument("--jobs", metavar="N", help="processes [all cores]")
+        table = actions.add_parser("table", help="compare entries")
+        table.add_argument(
+            "files", metavar="FILE", nargs="+", help="files of entries, or directories that `enter` wrote"
+        )
+        table.add_argument("--out", metavar="DIR", help="directory for the page and its figure [runs/league-1/table]")
+        table.add_argument("--json", action="store_true", help="print the table as JSON")
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Do one of the actions."""
+        from dtsa_bench.experiments.league import league
+
+        if getattr(args, "path", None):
+            sys.path.insert(0, str(Path(args.path).resolve()))
+            importlib.invalidate_caches()
+        return {"cells": _cells, "enter": _enter, "check": _check, "table": _table}[args.action](args, league())
+
 
 SAMPLE = 24  # flights of an entry that `check` flies again
+
+
 _SHOWN = 10  # differences that are named; the others are counted
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the command's options."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    actions.add_parser("cells", help="list what is flown")
-    enter = actions.add_parser("enter", help="fly a policy through all cells")
-    enter.add_argument("policy", metavar="POLICY", help="a scheme of `league cells`, or a policy by its name")
-    enter.add_argument("--name", metavar="NAME", help="name of the entry [the scheme's]")
-    enter.add_argument(
-        "--set", metavar="NAME=VALUE", action="append", help="a setting of the policy, or frame=extended"
-    )
-    enter.add_argument("--cells", metavar="NAME[,NAME...]", help="these alone; the entry is incomplete")
-    enter.add_argument("--sample", metavar="N", help="so many seeds of each cell; the entry is incomplete")
-    enter.add_argument("--cluster", metavar="tcp://HOST:PORT", help="fly on a Dask cluster with this scheduler")
-    enter.add_argument("--out", metavar="DIR", help="directory for entry.json [runs/league-1/NAME]")
-    check = actions.add_parser("check", help="fly a sample of entries again")
-    check.add_argument("file", metavar="FILE", help="file of entries, or directory that `enter` wrote")
-    check.add_argument("names", metavar="NAME", nargs="*", help="which of its entries [all]")
-    check.add_argument("--sample", metavar="N", default=str(SAMPLE), help=f"so many flights of each [{SAMPLE}]")
-    check.add_argument("--all", action="store_true", help="all flights")
-    check.add_argument("--seed", metavar="N", help="which flights are flown again [at random]")
-    for action in (enter, check):
-        action.add_argument("--path", metavar="DIR", help="where Python also looks for installed plug-ins")
-        action.add_argument("--jobs", metavar="N", help="processes [all cores]")
-    table = actions.add_parser("table", help="compare entries")
-    table.add_argument("files", metavar="FILE", nargs="+", help="files of entries, or directories that `enter` wrote")
-    table.add_argument("--out", metavar="DIR", help="directory for the page and its figure [runs/league-1/table]")
-    table.add_argument("--json", action="store_true", help="print the table as JSON")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Do one of the actions."""
-    from dtsa_bench.experiments.league import league
-
-    if getattr(args, "path", None):
-        sys.path.insert(0, str(Path(args.path).resolve()))
-        importlib.invalidate_caches()
-    return {"cells": _cells, "enter": _enter, "check": _check, "table": _table}[args.action](args, league())
 
 
 def _cells(args: argparse.Namespace, the_league: League) -> int:
@@ -143,7 +148,7 @@ def _check(args: argparse.Namespace, the_league: League) -> int:
 
 def _table(args: argparse.Namespace, the_league: League) -> int:
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.experiments.league import HEADS, LeagueTable, read_entries
+    from dtsa_bench.experiments.league import HEADS, STAR, LeagueTable, read_entries
     from dtsa_bench.experiments.tables import aligned
     from dtsa_bench.pages.report.tables import write_league
 
@@ -157,6 +162,28 @@ def _table(args: argparse.Namespace, the_league: League) -> int:
     if args.json:
         print(json.dumps([dict(zip(HEADS, line, strict=True)) for line in table.lines("-")], indent=1))
     else:
-        print(aligned([HEADS, *table.lines("-")]))
+        print(f"{aligned([HEADS, *table.lines('-')])}\n{STAR}")
         print(f"table: {page}")
     return 0
+
+
+class NewPluginCommand(Command):
+    description = """\
+Writes a package with a policy of your own that works: the policy, a test, a sweep that sets it against the league's
+best and the bound, and the lines that install and run it. What a policy is given and what it
+returns: docs/reference/plug-ins.md."""
+    examples = (("my-policy --out plugins/my-policy", "then as its README.md says"),)
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("name", metavar="NAME", help="what the policy will be called, as in my-policy")
+        parser.add_argument(
+            "--out", metavar="DIR", help="where the package goes (default: a directory of that name here)"
+        )
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Write the package."""
+        from dtsa_bench.experiments.plugin_template import write_package
+
+        for path in write_package(args.name, Path(args.out or args.name)):
+            print(path)
+        return 0

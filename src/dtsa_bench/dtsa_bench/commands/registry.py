@@ -1,8 +1,15 @@
-"""Names of the commands. `tools/dtsa` reads this before anything is installed: it imports nothing but Python's own."""
+"""The commands: their names, and what a command is.
+
+`tools/dtsa` reads this before anything is installed, so it imports the standard library alone.
+"""
 
 from __future__ import annotations
 
+import argparse
 import difflib
+import importlib
+import importlib.util
+import sys
 from collections.abc import Iterable, Mapping
 
 COMMANDS = {
@@ -30,21 +37,94 @@ COMMANDS = {
 
 RECORDED_RUN = "run directory, bag directory or .mcap file"  # what commands take that read one
 
-_MODULES: dict[str, str] = {}  # of commands that do not belong to this package
+_MODULES = {
+    name: f"dtsa_bench.commands.{module}"
+    for module, names in {
+        "fly": ("fly",),
+        "demo": ("demo",),
+        "network": ("agent", "sniff"),
+        "simulation": ("simulate", "sweep"),
+        "league": ("league", "new-plugin"),
+        "playback": ("replay", "view"),
+        "recordings": ("verify", "merge", "losses", "recover", "report", "export"),
+        "crazyflies": ("bridge", "fake-crazyflie", "peer-lab"),
+        "cli": ("completion",),
+    }.items()
+    for name in names
+}
 
 
-def add(package: str, commands: Mapping[str, str]) -> None:
-    """Adds the commands of another package, for the command line of a checkout."""
+class Command:
+    """A command of the command line. Its class is called after it: that of `fake-crazyflie` is FakeCrazyflieCommand."""
+
+    description: str
+    examples: tuple[tuple[str, str], ...] = ()  # words after the command's name, and what they do
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the command's options."""
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Do it; the exit code."""
+        raise NotImplementedError
+
+
+def add_commands(commands: Mapping[str, str], modules: Mapping[str, str]) -> None:
+    """Add commands of another package, what each does and its module, for the command line of a checkout."""
     COMMANDS.update(commands)
-    _MODULES.update({name: f"{package}.{name.replace('-', '_')}" for name in commands})
+    _MODULES.update(modules)
 
 
-def module_of(command: str) -> str:
-    """Name of the module of a command."""
-    return _MODULES.get(command, f"dtsa_bench.commands.{command.replace('-', '_')}")
+def load_command(name: str) -> Command:
+    """Import the module of a command; return the command."""
+    command = getattr(importlib.import_module(_MODULES[name]), f"{name.title().replace('-', '')}Command")()
+    assert isinstance(command, Command)
+    return command
 
 
 def hint(word: str, words: Iterable[str]) -> str:
     """A question that names the nearest of the words that would have been right; empty if none is near."""
     near = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
     return f"; did you mean {near[0]}?" if near and near[0] != word else ""
+
+
+_WORKSPACE = "build the workspace and source it: colcon build && . install/setup.bash"
+_ROS = "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout on x86_64"
+_HOW = {
+    **dict.fromkeys(("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim"), _WORKSPACE),
+    **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard", "pyarrow", "pandas", "aiohttp", "shtab"), "pip install {}"),
+    **dict.fromkeys(("cflib", "distributed"), "pip install {}"),
+    **dict.fromkeys(
+        ("rclpy", "ament_index_python", "builtin_interfaces", "geometry_msgs", "nav_msgs", "std_msgs"), _ROS
+    ),
+    **dict.fromkeys(("serial", "cobs"), "pip install pyserial cobs"),
+    "yaml": "apt install python3-yaml, or pip install pyyaml",
+    **dict.fromkeys(("numpy", "scipy", "matplotlib", "rich"), "apt install python3-{0}, or pip install {0}"),
+}
+
+
+def _explanation(error: ImportError) -> str:
+    """What is missing and how to get it; empty if the error is not about a package that we use."""
+    name = (error.name or "").split(".")[0]
+    how = _HOW.get(name)
+    if name == "dtsa_msgs" and not _is_installed("rclpy"):
+        how = _ROS  # there is nothing to build a workspace on
+    return f"the Python package {name} is missing: {how.format(name)} (docs/how-to/install.md)" if how else ""
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def report_missing_package(program: str, error: ImportError) -> int:
+    """Print one line about a missing package.
+
+    :raises ImportError: the error itself, if it is about something else.
+    """
+    text = _explanation(error)
+    if not text:
+        raise error
+    print(f"{program}: error: {text}", file=sys.stderr)
+    return 2

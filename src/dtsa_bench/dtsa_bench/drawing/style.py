@@ -14,6 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
+from dtsa_agent.core.errors import ConfigError
+
 from . import palette
 
 INK, QUIET, GRID = "#1d2733", "#5b6774", "#dfe4ea"
@@ -64,8 +66,18 @@ def colours(names: Sequence[object]) -> list[str]:
     return [own if own is not None else next(spare) for own in taken]
 
 
-def panels(count: int, width: float = 3.3, height: float = 3.1, columns: int = 3) -> tuple[Figure, list[Axes]]:
-    """A figure with some panels side by side, each so many inches large; `columns`: most in a row."""
+def panels(
+    count: int, width: float = 3.3, height: float = 3.1, columns: int = 3, given: Sequence[Axes] | None = None
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with panels side by side, each so many inches large, at most `columns` in a row.
+
+    :param given: the panels of another figure, to draw in instead.
+    :raises ConfigError: if they are not as many.
+    """
+    if given is not None:
+        if len(given) != count:
+            raise ConfigError("ax", f"{len(given)} axes", f"{count}, one a panel")
+        return given[0].get_figure(root=True), list(given)  # type: ignore[return-value]
     across = min(count, columns)
     down = -(-count // across)
     figure = Figure(figsize=(width * across, height * down), layout="constrained")
@@ -76,17 +88,14 @@ def panels(count: int, width: float = 3.3, height: float = 3.1, columns: int = 3
     return figure, axes[:count]
 
 
-def legend_above(figure: Figure, handles: Sequence[Any], names: Sequence[object]) -> None:
-    """One legend for all panels, above them."""
-    if len(names) > 1:
-        figure.legend(
-            handles,
-            [str(name) for name in names],
-            loc="outside upper left",
-            ncols=min(len(names), 5),
-            columnspacing=1.4,
-            handlelength=1.4,
-        )
+def add_legend(axes: Sequence[Axes], handles: Sequence[Any], names: Sequence[object], *, above: bool) -> None:
+    """Add one legend for all panels: above them, or in the first one, where the figure is another one's."""
+    texts = [str(name) for name in names]
+    if len(texts) > 1 and above:
+        place: dict[str, Any] = {"loc": "outside upper left", "ncols": min(len(texts), 5), "columnspacing": 1.4}
+        axes[0].figure.legend(handles, texts, handlelength=1.4, **place)
+    elif len(texts) > 1:
+        axes[0].legend(handles, texts)
 
 
 def svg_text(figure: Figure) -> str:

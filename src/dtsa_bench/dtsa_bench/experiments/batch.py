@@ -259,8 +259,10 @@ def _on_cores(batch: Batch, tasks: list[Task], jobs: int) -> Chunks:
                     waiting.extend([task] for task in chunk)
                     deaths += 1
                     if deaths > _RESTARTS:
-                        said = "worker processes died; runs that came back are saved (out of memory? try fewer --jobs)"
-                        raise DtsaError(f"{deaths} {said}; the same command goes on from there") from None
+                        message = (
+                            "worker processes died; runs that came back are saved (out of memory? try fewer --jobs)"
+                        )
+                        raise DtsaError(f"{deaths} {message}; the same command goes on from there") from None
                     continue
                 idle.append(connection)
                 yield result
@@ -269,16 +271,24 @@ def _on_cores(batch: Batch, tasks: list[Task], jobs: int) -> Chunks:
 @contextlib.contextmanager
 def _worker(batch: Batch) -> Iterator[Connection]:
     """A worker process, in a session of its own, which Ctrl-C does not reach; it ends when this one has gone."""
-    here, there = Pipe()
+    own_end, worker_end = Pipe()
     code = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import dtsa_bench.experiments.batch as batch; "
-    words = [sys.executable, "-c", f"{code}batch.serve(int(sys.argv[1]))", str(there.fileno()), json.dumps(sys.path)]
-    with here, there:
-        process = subprocess.Popen(words, pass_fds=[there.fileno()], stdin=subprocess.DEVNULL, start_new_session=True)
-        there.close()
+    words = [
+        sys.executable,
+        "-c",
+        f"{code}batch.serve(int(sys.argv[1]))",
+        str(worker_end.fileno()),
+        json.dumps(sys.path),
+    ]
+    with own_end, worker_end:
+        process = subprocess.Popen(
+            words, pass_fds=[worker_end.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
+        )
+        worker_end.close()
         try:
             with contextlib.suppress(OSError):
-                here.send(batch)
-            yield here
+                own_end.send(batch)
+            yield own_end
         finally:
             process.kill()
             process.wait()
@@ -310,7 +320,7 @@ def _on_cluster(batch: Batch, tasks: list[Task], address: str) -> Chunks:
         stack.callback(client.cancel, futures, force=True)
         for future in as_completed(futures, loop=client.loop):
             if fault := future.exception():
-                said = f"the cluster gave up on some runs ({_text_of(fault)}); those that came back are saved"
-                raise DtsaError(f"{said}; the same command goes on from there") from fault
+                message = f"the cluster gave up on some runs ({_text_of(fault)}); those that came back are saved"
+                raise DtsaError(f"{message}; the same command goes on from there") from fault
             yield future.result()
             future.release()

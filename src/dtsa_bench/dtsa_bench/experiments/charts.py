@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -22,8 +22,8 @@ from dtsa_bench.drawing.style import (
     ON_LIGHT,
     PAPER,
     QUIET,
+    add_legend,
     colours,
-    legend_above,
     panels,
     style,
 )
@@ -61,13 +61,13 @@ def _whiskers(points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.nan_to_num(np.maximum(np.stack((value - low, high - value)), 0.0))
 
 
-def bars(table: SweepTable, spec: Spec) -> Figure:
+def bars(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> Figure:
     """Grouped bars: a panel a measure, a group for each level of ``x``, a bar for each of ``series``."""
     measures, xs = list(spec["y"]), table.levels(spec["x"])
     series = table.levels(spec["series"]) if "series" in spec else [None]
     shades = colours(xs if series == [None] else series)
     wide = max(3.3, 0.42 * len(xs) * len(series) + 1.2)
-    figure, axes = panels(len(measures), width=wide)
+    figure, axes = panels(len(measures), width=wide, given=given)
     handles: list[Any] = []
     for axis, measure in zip(axes, measures, strict=True):
         width = 0.8 / len(series)
@@ -81,7 +81,7 @@ def bars(table: SweepTable, spec: Spec) -> Figure:
             if axis is axes[0]:
                 handles.append(drawn)
         _dress(axis, spec, measure, xs)
-    legend_above(figure, handles, series)
+    add_legend(axes, handles, series, above=given is None)
     return figure
 
 
@@ -89,10 +89,7 @@ def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
     axis.set_title(label_of(measure))
     crowded = any(len(str(x)) > 8 for x in xs)
     axis.set_xticks(
-        range(len(xs)),
-        [str(x) for x in xs],
-        rotation=20 if crowded else 0,
-        ha="right" if crowded else "center",
+        range(len(xs)), [str(x) for x in xs], rotation=20 if crowded else 0, ha="right" if crowded else "center"
     )
     axis.set_xlabel(AXIS_LABELS.get(spec["x"], spec["x"]))
     axis.grid(axis="x", visible=False)
@@ -109,14 +106,14 @@ def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
         axis.yaxis.set_major_formatter(PercentFormatter(1.0))
 
 
-def lines(table: SweepTable, spec: Spec) -> Figure:
+def lines(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> Figure:
     """A line for each of ``series`` over the numbers of ``x``; a panel for each of ``facets`` and measure."""
     facets = table.levels(spec["facets"]) if "facets" in spec else [None]
     series = table.levels(spec["series"]) if "series" in spec else [None]
     xs = table.levels(spec["x"])
     shades = colours(series)
     shown = [(facet, measure) for measure in spec["y"] for facet in facets]
-    figure, axes = panels(len(shown), width=4.6, height=3.3, columns=2)
+    figure, axes = panels(len(shown), width=4.6, height=3.3, columns=2, given=given)
     handles: list[Any] = []
     for axis, (facet, measure) in zip(axes, shown, strict=True):
         for number, name in enumerate(series):
@@ -124,18 +121,18 @@ def lines(table: SweepTable, spec: Spec) -> Figure:
                 {} if name is None else {spec["series"]: name}
             )
             data = _points(table, labels, spec["x"], measure)
-            known = np.isfinite(data[:, 0])
-            place = np.array(xs, dtype=float)[known]
+            finite = np.isfinite(data[:, 0])
+            place = np.array(xs, dtype=float)[finite]
             # Lines that lie on each other stay visible: later ones are thinner.
             (line,) = axis.plot(
                 place,
-                data[known, 0],
+                data[finite, 0],
                 color=shades[number],
                 marker=MARKERS[number % len(MARKERS)],
                 linewidth=2.6 - 0.35 * number,
                 markersize=5.5 - 0.5 * number,
             )
-            axis.fill_between(place, data[known, 1], data[known, 2], color=shades[number], alpha=0.13, linewidth=0)
+            axis.fill_between(place, data[finite, 1], data[finite, 2], color=shades[number], alpha=0.13, linewidth=0)
             if axis is axes[0]:
                 handles.append(line)
         title = label_of(measure)
@@ -147,7 +144,7 @@ def lines(table: SweepTable, spec: Spec) -> Figure:
             axis.yaxis.set_major_formatter(PercentFormatter(1.0))
         if measure in spec.get("log", ()):
             _logarithmic(axis)
-    legend_above(figure, handles, series)
+    add_legend(axes, handles, series, above=given is None)
     return figure
 
 
@@ -164,7 +161,7 @@ def _facet(axis: str, value: object) -> str:
     return f"{value} ms slots" if axis == "slot_ms" else str(value)
 
 
-def matrix(table: SweepTable, spec: Spec) -> Figure:
+def matrix(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> Figure:
     """A coloured cell with its number for each of ``rows`` and ``columns``; a panel for each of ``facets``."""
     facets = table.levels(spec["facets"]) if "facets" in spec else [None]
     rows, columns, measure = table.levels(spec["rows"]), table.levels(spec["columns"]), spec["y"][0]
@@ -175,8 +172,9 @@ def matrix(table: SweepTable, spec: Spec) -> Figure:
         width=1.5 + 0.075 * longest + wide * len(columns),
         height=1.05 + 0.36 * len(rows),
         columns=2,
+        given=given,
     )
-    finite = [value for group in table.flown if math.isfinite(value := group.point(measure)[0])]
+    finite = [value for group in table.groups_with_runs if math.isfinite(value := group.point(measure)[0])]
     top = 1.0 if measure == CRASHED else max(finite, default=1.0)
     bottom = 0.0 if measure == CRASHED else min(finite, default=0.0)
     for axis, facet in zip(axes, facets, strict=True):

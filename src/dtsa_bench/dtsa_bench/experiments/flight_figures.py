@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dtsa_bench.drawing import palette
 from dtsa_bench.drawing.flight_paths import paint
-from dtsa_bench.drawing.style import CYCLE, INK, legend_above, panels
+from dtsa_bench.drawing.style import CYCLE, INK, add_legend, panels
 from dtsa_bench.simulation.simulate import SimulatedFlight, simulate
 
 from .tables import SweepTable
@@ -95,7 +95,7 @@ def estimate(table: SweepTable, spec: Spec) -> Figure:
     errors.set_title("distance between the two [cm]")
     errors.set_xlabel("time [s]")
     errors.legend()
-    legend_above(figure, handles, ["flown", "estimated by another", "received"])
+    add_legend(axes, handles, ["flown", "estimated by another", "received"], above=True)
     return figure
 
 

@@ -25,7 +25,7 @@ from dtsa_agent.yaml_file import read_yaml
 from dtsa_bench import __version__
 
 from .batch import FAILED, Batch, Row, Task, key_of, run_all, write_whole
-from .provenance import made_with
+from .provenance import read_provenance
 from .statistics import LEVEL, Share, wilson
 from .sweep import cost_of, run_config
 from .tables import share_texts
@@ -42,6 +42,8 @@ SCHEME_SETTINGS = (
     "policy", "frame", "options", "gossip", "epsilon", "selection", "boot_round", "age_cap", "return_every",
     "anchor_every", "anchor_rest", "open_every", "adoption", "depth_rate", "lease_share",
 )  # fmt: skip
+#: Below a table: what the star at a rank means.
+STAR = "* Flown by looking into all agents, in place of what a radio would have to tell."
 HEADS = ("rank", "scheme", "lost", "crashed", "out of time", "age, ms", "on the air", "worst cell")
 _SHORTEST, _STEP_NS = "shortest", 10_000  # slots as short as the frames allow, rounded up
 _LEAST_AGE_MS = 0.01  # smaller ages count as this one: their logarithm is taken
@@ -102,18 +104,18 @@ def make_entry(the_league: League, what: str, name: str | None, changes: Mapping
     own = the_league.entrants.get(what, {"policy": what})
     scheme = {key: value for key, value in own.items() if key != "bound"} | dict(changes)
     if what not in the_league.entrants and what not in POLICIES.rows and what not in POLICIES.plug_in_names():
-        known = sorted({*the_league.entrants, *POLICIES.plug_in_names()})
-        raise ConfigError("POLICY", what, f"{', '.join(known)}, or a plug-in that --path finds")
+        names = sorted({*the_league.entrants, *POLICIES.plug_in_names()})
+        raise ConfigError("POLICY", what, f"{', '.join(names)}, or a plug-in that --path finds")
     check_scheme(scheme)
     chosen = name or what
     if not _NAME.fullmatch(chosen):
         raise ConfigError("name", chosen, "lower-case letters, digits, dots and hyphens, 40 at most")
     needs_everybody = POLICIES.row(scheme["policy"]).needs_everybody
     bound = bool(own.get("bound", needs_everybody and what not in the_league.entrants))
-    made, plug_in = made_with(), POLICIES.plug_ins().get(scheme["policy"])
+    provenance, plug_in = read_provenance(), POLICIES.plug_ins().get(scheme["policy"])
     package = f"{plug_in.dist.name} {plug_in.dist.version}" if plug_in and plug_in.dist else f"dtsa {__version__}"
-    commit = made["commit"][:9] + (" with changes" if made["tree_changed"] else "")
-    described = {"package": package, "commit": commit, "date": made["date"][:10]}
+    commit = provenance["commit"][:9] + (" with changes" if provenance["tree_changed"] else "")
+    described = {"package": package, "commit": commit, "date": provenance["date"][:10]}
     return {"name": chosen, "bound": bound, "scheme": scheme, **described, "flights": {}}
 
 
@@ -155,8 +157,8 @@ def fly(task: Task) -> tuple[str, Row]:
     digest = hashlib.sha256(json.dumps([list(ids) for ids in log.senders()]).encode())
     digest.update(log.outcome.tobytes())
     digest.update(log.position.astype("<f8", copy=False).tobytes())
-    known = {**summary, "slots": summary["slots"]["total"], "digest": digest.hexdigest()[:16]}
-    return summary["end"], {name: known[name] for name in FIELDS[1:]}
+    values = {**summary, "slots": summary["slots"]["total"], "digest": digest.hexdigest()[:16]}
+    return summary["end"], {name: values[name] for name in FIELDS[1:]}
 
 
 def flight_of(row: Row) -> list[Any]:
@@ -196,8 +198,8 @@ def read_entries(path: str | Path) -> list[Entry]:
         for entry in entries:
             texts = all(isinstance(text, str) for text in (entry["name"], entry["scheme"]["policy"]))
             for cell, flights in entry["flights"].items():
-                known = cell in the_league.cells and len(flights) <= the_league.seed_count
-                if not texts or not known or not all(map(_is_flight, flights)):
+                fits = cell in the_league.cells and len(flights) <= the_league.seed_count
+                if not texts or not fits or not all(map(_is_flight, flights)):
                     raise ValueError(f"{entry['name']}: {cell}: not the flights of a cell")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError("FILE", str(path), f"entries of a league, JSON ({error})") from error
@@ -206,8 +208,8 @@ def read_entries(path: str | Path) -> list[Entry]:
 
 def _is_flight(flight: Sequence[Any]) -> bool:
     status, *numbers, digest = flight
-    known = all(isinstance(n, (int, float)) and math.isfinite(n) for n in numbers if n is not None)
-    return known and len(flight) == len(FIELDS) and isinstance(status, str) and isinstance(digest, (str, type(None)))
+    finite = all(isinstance(n, (int, float)) and math.isfinite(n) for n in numbers if n is not None)
+    return finite and len(flight) == len(FIELDS) and isinstance(status, str) and isinstance(digest, (str, type(None)))
 
 
 def check_entry(
@@ -226,9 +228,9 @@ def check_entry(
     rows = run_all(batch, jobs=jobs)
     differences = []
     for (cell, k), task in zip(chosen, batch.tasks, strict=True):
-        for field, told, again in zip(FIELDS, flights[cell, k], flight_of(rows[task.key]), strict=True):
-            if told != again or isinstance(told, bool):
-                differences.append(f"{entry['name']}: {cell}/{k}: {field} {told}; flown again {again}")
+        for field, recorded, recomputed in zip(FIELDS, flights[cell, k], flight_of(rows[task.key]), strict=True):
+            if recorded != recomputed or isinstance(recorded, bool):
+                differences.append(f"{entry['name']}: {cell}/{k}: {field} {recorded}; flown again {recomputed}")
     return len(chosen), differences
 
 
@@ -253,7 +255,7 @@ def scores(the_league: League, flights: Mapping[str, Sequence[Sequence[Any]]]) -
         for cell, lines in flights.items()
     ]
     loads = [[flight[_LOAD] for flight in lines if flight[_LOAD] is not None] for lines in flights.values()]
-    known = [np.mean(part) for part in loads if part]
+    means = [np.mean(part) for part in loads if part]
     mean = float(np.mean([part.mean() for part in ages]))
     variances = [float(part.var(ddof=1) / len(part)) if len(part) > 1 else 0.0 for part in ages]
     half = NormalDist().inv_cdf(0.5 + LEVEL / 2) * math.sqrt(sum(variances)) / len(ages)
@@ -263,7 +265,7 @@ def scores(the_league: League, flights: Mapping[str, Sequence[Sequence[Any]]]) -
         ends.count("timed out"),
         ends.count(FAILED),
         (math.exp(mean), math.exp(mean - half), math.exp(mean + half)),
-        float(np.mean(known)) if known else math.nan,
+        float(np.mean(means)) if means else math.nan,
     )
 
 
@@ -292,8 +294,8 @@ class LeagueTable:
         total = {entry["name"]: scores(the_league, entry["flights"]) for entry in entries}
 
         def order(entry: Entry) -> tuple[bool, float, float, str]:
-            found = total[entry["name"]]
-            return bool(entry["bound"]), found.lost.count * found.age_ms[0], found.age_ms[0], entry["name"]
+            score = total[entry["name"]]
+            return bool(entry["bound"]), score.lost.count * score.age_ms[0], score.age_ms[0], entry["name"]
 
         self.entries = sorted(entries, key=order)  # the best first
         self.scores = [total[entry["name"]] for entry in self.entries]
@@ -316,7 +318,7 @@ class LeagueTable:
             not_flown = f" + {total.failed} not flown" if total.failed else ""
             lines.append(
                 [
-                    "bound" if entry["bound"] else str(rank),
+                    "bound" if entry["bound"] else f"{rank}*" if _sees_everything(entry) else str(rank),
                     entry["name"],
                     f"{count} ({percent})",
                     str(total.crashed),
@@ -328,19 +330,23 @@ class LeagueTable:
             )
         return lines
 
-    def _badness(self, cell: str, found: Scores) -> tuple[float, float]:
+    def _badness(self, cell: str, score: Scores) -> tuple[float, float]:
         """Order of cells: share of lost flights, then age for that of lost ones."""
-        return found.lost.value, found.age_ms[0] / self.league.cells[cell]["lost_age_ms"]
+        return score.lost.value, score.age_ms[0] / self.league.cells[cell]["lost_age_ms"]
 
     def cell_lines(self) -> list[list[str]]:
         """Return a line an entry: of each cell age in ms, and in brackets lost flights, if any."""
         return [
-            [
-                entry["name"],
-                *(figure(s.age_ms[0]) + (f" ({s.lost})" if s.lost.count else "") for s in cells.values()),
-            ]
+            [entry["name"], *(figure(s.age_ms[0]) + (f" ({s.lost})" if s.lost.count else "") for s in cells.values())]
             for entry, cells in zip(self.entries, self.by_cell, strict=True)
         ]
+
+
+def _sees_everything(entry: Entry) -> bool:
+    """Whether the simulator flies the entry by looking into all agents; unknown plug-ins do not count."""
+    policy = entry["scheme"]["policy"]
+    here = policy in POLICIES.rows or policy in POLICIES.plug_in_names()
+    return here and POLICIES.row(policy).needs_everybody
 
 
 def percent_text(share: float) -> str:

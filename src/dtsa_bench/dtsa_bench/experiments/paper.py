@@ -16,7 +16,7 @@ from dtsa_bench.drawing.style import save_described
 
 from .batch import write_whole
 from .charts import draw
-from .provenance import made_with
+from .provenance import read_provenance
 from .sweep import Sweep
 from .tables import CRASHED, MEASURES, SweepTable, latex_table
 
@@ -54,7 +54,7 @@ def write_paper(table: SweepTable, directory: Path, form: str, code: str, comman
         names.append(path.name)
     # Crashes, ages, and what the sweep's figures show; of a sweep without figures, distances.
     shown = [name for spec in sweep.figures for name in spec.get("y", ())] or ["min_distance_m"]
-    measures = table.known([name for name in dict.fromkeys(("age_mean_slots", *shown)) if name in MEASURES])
+    measures = table.measured([name for name in dict.fromkeys(("age_mean_slots", *shown)) if name in MEASURES])
     write_whole(directory / "table.tex", latex_table(table, [CRASHED, *measures], comments))
     frame = table.groups_frame()
     write_whole(directory / "table.csv", frame[frame["runs"] > 0].to_csv(index=False, na_rep="nan"))
@@ -65,16 +65,16 @@ def write_paper(table: SweepTable, directory: Path, form: str, code: str, comman
 
 def _origin(table: SweepTable, code: str, command: str) -> dict[str, str]:
     """How it was made, by name."""
-    sweep, made = table.sweep, made_with()
-    changed = ", with changes" if made["tree_changed"] else ""
+    sweep, provenance = table.sweep, read_provenance()
+    changed = ", with changes" if provenance["tree_changed"] else ""
     return {
         "sweep": f"{sweep.name}, {len(table.rows)} flights, {len(sweep.cells)} settings",
         "command": command,
         "seeds": seeds_text(sweep.seeds),
-        "written": str(made["date"]),
-        "commit": f"{made['commit']}{changed}",
+        "written": str(provenance["date"]),
+        "commit": f"{provenance['commit']}{changed}",
         "code": f"{code} (digest of the code that flew)",
-        "versions": f"dtsa {__version__}, Python {made['python']}, NumPy {np.__version__}, "
+        "versions": f"dtsa {__version__}, Python {provenance['python']}, NumPy {np.__version__}, "
         f"Matplotlib {matplotlib.__version__}",
     }
 
@@ -92,11 +92,11 @@ def _figures(sweep: Sweep) -> Sequence[Mapping[str, Any]]:
         return sweep.figures
     axes, y = list(sweep.axes), [CRASHED, "age_mean_slots"]
     x = next((axis for axis in axes if _numbers([cell.labels[axis] for cell in sweep.cells])), None)
-    rest = [axis for axis in axes if axis != (axes[0] if x is None else x)]
-    roles = dict(zip(("series", "facets"), rest, strict=False))
-    if x is not None and len(rest) <= 2:
+    others = [axis for axis in axes if axis != (axes[0] if x is None else x)]
+    roles = dict(zip(("series", "facets"), others, strict=False))
+    if x is not None and len(others) <= 2:
         return [{"kind": "lines", "name": "lines", "x": x, "y": y, **roles}]
-    return [{"kind": "bars", "name": "bars", "x": axes[0], "y": y, **roles}] if x is None and len(rest) <= 1 else []
+    return [{"kind": "bars", "name": "bars", "x": axes[0], "y": y, **roles}] if x is None and len(others) <= 1 else []
 
 
 def _numbers(levels: Sequence[object]) -> bool:

@@ -44,12 +44,12 @@ def code_digest(plug_ins: frozenset[tuple[str, str]] = frozenset()) -> str:
 def _modules_of(kind: str, name: str) -> set[str]:
     """Top-level modules of a plug-in's distribution; builders other than setuptools list its files alone."""
     registry = _REGISTRIES[kind]
-    found = {registry.factory(name).__module__}
+    modules = {registry.factory(name).__module__}
     installed = None if name in registry.registered else registry.plug_ins()[name].dist
     if installed is not None:
-        found.update((installed.read_text("top_level.txt") or "").split())
-        found.update(p.parts[0].removesuffix(".py") for p in installed.files or () if p.suffix == ".py")
-    return {module.partition(".")[0] for module in found} - {*PROJECT, "dtsa", "__main__", ""}
+        modules.update((installed.read_text("top_level.txt") or "").split())
+        modules.update(p.parts[0].removesuffix(".py") for p in installed.files or () if p.suffix == ".py")
+    return {module.partition(".")[0] for module in modules} - {*PROJECT, "dtsa", "__main__", ""}
 
 
 def _files_of(module: str) -> Iterator[Path]:
@@ -66,7 +66,7 @@ def _files_of(module: str) -> Iterator[Path]:
         yield Path(spec.origin)
 
 
-def made_with() -> dict[str, Any]:
+def read_provenance() -> dict[str, Any]:
     """Return the commit of the checkout and whether the tree differs from it; date, cores and Python."""
     ours = _git("ls-files", "--error-unmatch", Path(__file__).name)  # an installation may lie in another repository
     commit = _git("rev-parse", "HEAD") if ours else ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -40,21 +40,6 @@ class Mean:
     low: float
     high: float
     count: int  # values it is the mean of
-
-
-def median_interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, float]:
-    """Return two of the values between which the true median lies, whatever the distribution (sign test).
-
-    :param level: probability that it does, at least; with fewer than six values it is less than 0.95.
-    :raises ValueError: without values.
-    """
-    ordered = sorted(values)
-    if not ordered:
-        raise ValueError("values: got none; allowed: one or more")
-    count, cut, below = len(ordered), 0, 1  # values left out at either end; ways in which so few lie on one side
-    while (below := below + math.comb(count, cut + 1)) <= (1.0 - level) * 2.0 ** (count - 1):
-        cut += 1
-    return ordered[cut], ordered[-1 - cut]
 
 
 def wilson(count: int, total: int, level: float = LEVEL) -> Share:

@@ -10,11 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import UNKNOWN, ConfigError
 from dtsa_agent.core.plugins.entry_points import plug_ins_named
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.settings.declaration import Settings, check, setting, settings_of
+from dtsa_agent.core.settings.declaration import Setting, Settings, check, setting, settings_of
 from dtsa_agent.yaml_file import read_yaml
 from dtsa_bench.runs.config import FROM_SWARM, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig, MeasuredLosses
@@ -39,10 +39,10 @@ RESERVED = frozenset(
     ("key", "cell", "summary", "runs", "timed_out", "left_out", "crashed", "wasted_share", *COMMON, *VALUES)
 )
 # Settings by section. Those of the channel that follow from the swarm's are left out.
-_SECTIONS = {
-    "swarm": tuple(spec.name for spec in settings_of(SwarmConfig)),
-    "channel": tuple(spec.name for spec in settings_of(ChannelConfig) if spec.name not in FROM_SWARM),
-    "limits": tuple(spec.name for spec in settings_of(RunLimits)),
+_SECTIONS: dict[str, dict[str, Setting]] = {
+    "swarm": {spec.name: spec for spec in settings_of(SwarmConfig)},
+    "channel": {spec.name: spec for spec in settings_of(ChannelConfig) if spec.name not in FROM_SWARM},
+    "limits": {spec.name: spec for spec in settings_of(RunLimits)},
 }
 
 
@@ -149,11 +149,16 @@ def run_config(settings: Mapping[str, Any]) -> RunConfig:
     for name, value in settings.items():
         section = section_of(name)
         if section is None:
-            raise ConfigError(name, value, "one of the settings " + ", ".join(sum(_SECTIONS.values(), ())))
+            raise ConfigError(name, value, UNKNOWN + ", ".join(setting_specs()))
         parts[section][name] = value
     swarm = SwarmConfig.from_dict(parts["swarm"])
     channel = {**from_swarm(swarm), **parts["channel"]}
     return RunConfig(swarm, ChannelConfig.from_dict(channel), RunLimits(**parts["limits"]))
+
+
+def setting_specs() -> dict[str, Setting]:
+    """Return the settings of a run by their flat names."""
+    return {name: spec for section in _SECTIONS.values() for name, spec in section.items()}
 
 
 def section_of(name: str) -> str | None:
@@ -224,17 +229,17 @@ def _check(cells: list[Cell], seed: int) -> None:
 
     :raises ConfigError: naming what is not usable.
     """
-    known: dict[tuple[Any, Any], dict[str, Any]] = {}  # by file and length of a slot
+    read: dict[tuple[Any, Any], dict[str, Any]] = {}  # by file and length of a slot
     for cell in cells:
         losses = cell.settings.get("losses")
         if not losses or isinstance(losses, Mapping):
             cell.run(seed)
             continue
         key = str(losses), cell.settings.get("slot_ms")
-        cell.settings["losses"] = known.get(key, losses)
-        found = cell.run(seed).air.losses
-        if isinstance(found, MeasuredLosses):
-            cell.settings["losses"] = known.setdefault(key, found.to_dict())
+        cell.settings["losses"] = read.get(key, losses)
+        losses_of_run = cell.run(seed).air.losses
+        if isinstance(losses_of_run, MeasuredLosses):
+            cell.settings["losses"] = read.setdefault(key, losses_of_run.to_dict())
 
 
 def _levels(axis: str, values: object) -> list[Any] | dict[str, dict[str, Any]]:
@@ -250,15 +255,15 @@ def _levels(axis: str, values: object) -> list[Any] | dict[str, dict[str, Any]]:
     raise ConfigError(f"axes.{axis}", values, "a list of values, or names with settings each")
 
 
-def _seeds(given: object, count: int | None, first: int | None) -> tuple[int, ...]:
+def _seeds(listed: object, count: int | None, first: int | None) -> tuple[int, ...]:
     """Seeds that a file lists, or a number of them from the first one on."""
-    if isinstance(given, list):
-        if not given or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in given):
-            raise ConfigError("seeds", given, "a number of seeds, or a list of whole numbers")
+    if isinstance(listed, list):
+        if not listed or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in listed):
+            raise ConfigError("seeds", listed, "a number of seeds, or a list of whole numbers")
         if count is None and first is None:
-            return tuple(given)
-        given = len(given)
-    number = given if count is None else count
+            return tuple(listed)
+        listed = len(listed)
+    number = listed if count is None else count
     if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= 1_000_000:
         raise ConfigError("seeds", number, "1 to 1000000")
     start = FIRST_SEED if first is None else first

@@ -75,7 +75,7 @@ class Group:
     def __init__(self, cell: Cell, rows: Sequence[Row]) -> None:
         self.cell, self.labels, self.rows = cell, cell.labels, list(rows)
         flown = [row for row in rows if row["status"] != FAILED]
-        self.flown, self.failed = len(flown), len(rows) - len(flown)
+        self.flown_count, self.failed = len(flown), len(rows) - len(flown)
         self.timed_out = sum(row["status"] == "timed out" for row in flown)
         self.crashed: Share = wilson(sum(bool(row["collided"]) for row in flown), len(flown))
         #: Runs that do not count for means of complete flights, by reason.
@@ -93,8 +93,8 @@ class Group:
         """Value and ends of the interval of :data:`CRASHED` or a measure; not a number if no run counts."""
         if measure == CRASHED and not self.crashed.total:
             return math.nan, math.nan, math.nan
-        found = self.crashed if measure == CRASHED else self.mean(measure)
-        return found.value, found.low, found.high
+        statistic = self.crashed if measure == CRASHED else self.mean(measure)
+        return statistic.value, statistic.low, statistic.high
 
     def texts(self, measure: str, dash: str = "–") -> tuple[str, str]:
         """Value and interval as text; a dash and nothing if no run counts."""
@@ -172,7 +172,7 @@ class SweepTable:
         self.groups = [Group(cell, rows) for cell, rows in zip(sweep.cells, cells, strict=True)]
 
     @property
-    def flown(self) -> list[Group]:
+    def groups_with_runs(self) -> list[Group]:
         """Groups that have rows."""
         return [group for group in self.groups if group.rows]
 
@@ -184,7 +184,7 @@ class SweepTable:
         """Groups with these labels."""
         return [g for g in self.groups if all(g.labels.get(axis) == value for axis, value in labels.items())]
 
-    def known(self, measures: Sequence[str] = tuple(MEASURES)) -> list[str]:
+    def measured(self, measures: Sequence[str] = tuple(MEASURES)) -> list[str]:
         """Those of some measures that any group has."""
         return [name for name in measures if any(group.mean(name).count for group in self.groups)]
 
@@ -243,11 +243,11 @@ def table_text(table: SweepTable, width: int = 0, shown: Sequence[str] = SHOWN, 
     :param width: characters in a line; 0: as many as it takes.
     :param most: groups shown; None: all.
     """
-    groups = table.flown[:most]
+    groups = table.groups_with_runs[:most]
     labels = [[axis, *(str(group.labels[axis]) for group in groups)] for axis in table.sweep.axes]
     out = ["out", *(str(group.left_out.total()) for group in groups)]
     blocks = []
-    for name in (CRASHED, *table.known(shown)):
+    for name in (CRASHED, *table.measured(shown)):
         values, intervals = zip(*(group.texts(name, "-") for group in groups), strict=True) if groups else ((), ())
         head = name if name == CRASHED else MEASURES[name].head or name
         blocks.append([[head, *values], ["95 %", *intervals], *([out] if name == CRASHED else [])])
@@ -257,17 +257,21 @@ def table_text(table: SweepTable, width: int = 0, shown: Sequence[str] = SHOWN, 
             parts[-1] += block
         else:
             parts.append([*labels, *block])
-    return "\n\n".join(aligned(list(zip(*part, strict=True))) for part in parts)
+    heads = [f"{MEASURES[name].head}: {label_of(name)}" for name in table.measured(shown) if MEASURES[name].head]
+    legend = "; ".join(["out: flights that did not end as they should, left out of distances and times", *heads])
+    if width:
+        legend = textwrap.fill(legend, width, break_long_words=False, break_on_hyphens=False)
+    return "\n\n".join([*(aligned(list(zip(*part, strict=True))) for part in parts), legend])
 
 
 def table_html(table: SweepTable, shown: Sequence[str] = SHOWN, most: int | None = None) -> str:
     """Return the same as an HTML table, in which a small picture shows each interval on the scale of its column."""
     import pandas as pd
 
-    groups, columns = table.flown, {}
+    groups, columns = table.groups_with_runs, {}
     for axis in table.sweep.axes:
         columns[html.escape(axis)] = [html.escape(str(group.labels[axis])) for group in groups]
-    for name in (CRASHED, *table.known(shown)):
+    for name in (CRASHED, *table.measured(shown)):
         points = [group.point(name) for group in groups]
         ends = [end for point in points for end in point if math.isfinite(end)]
         low, high = (0.0, 1.0) if name == CRASHED else (min(0.0, *ends), max(ends))
@@ -298,7 +302,7 @@ def latex_table(table: SweepTable, measures: Sequence[str], comments: Sequence[s
     """
     import pandas as pd
 
-    axes, groups = table.sweep.axes, table.flown
+    axes, groups = table.sweep.axes, table.groups_with_runs
     columns = {latex_text(axis): [latex_text(str(group.labels[axis])) for group in groups] for axis in axes}
     for name in measures:
         lines = r" \\{} ".join(map(latex_text, textwrap.wrap(label_of(name), _HEAD_WIDTH)))
@@ -320,4 +324,4 @@ def _latex_cell(value: str, interval: str) -> str:
 
 def latex_text(text: str) -> str:
     """Return a text as LaTeX prints it."""
-    return re.sub(r"[\\~^<>|–&%$#_{}]", lambda found: _LATEX[found.group()], text)
+    return re.sub(r"[\\~^<>|–&%$#_{}]", lambda match: _LATEX[match.group()], text)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dtsa_agent.core.agents.delays import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.ros.common.messages import Fields
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers

@@ -37,7 +37,7 @@ def run_of(config: SwarmConfig) -> RunConfig:
 
 def slots_until_all_known(config: SwarmConfig) -> int:
     """Slots after which each agent that is there can be known to all that hear it: (M + 2) N."""
-    return (config.heard_every + 2) * config.agents
+    return (config.turn_every + 2) * config.agents
 
 
 class PairKnowledge:

@@ -25,7 +25,7 @@ _FEWEST = 5  # frames expected, of which a share says something
 
 def lasts_s(config: SwarmConfig) -> float:
     """How long a check takes, s: until agents that begin cold have settled, and some rounds in which frames count."""
-    begun = 3 * config.heard_every * config.agents  # at the latest, where nothing is lost
+    begun = 3 * config.turn_every * config.agents  # at the latest, where nothing is lost
     return max(_LEAST_S, (begun + _settled_after(config) + _ROUNDS * config.agents) * config.slot_s)
 
 
@@ -147,7 +147,7 @@ class Check:
         if not row["heard"]:
             return [f"cf{agent} is not heard"]
         found, share = [], row["in_time_share"]
-        if row["silent_slots"] > max(_SILENT * self._slots, self._config.heard_every * self._config.agents):
+        if row["silent_slots"] > max(_SILENT * self._slots, self._config.turn_every * self._config.agents):
             found.append(f"cf{agent} was not heard in the last {row['silent_slots']} slots")
         elif self._expects and row["expected"] < _FEWEST:
             found.append(f"of cf{agent} {row['expected']} frames were expected, too few to tell: check for longer")

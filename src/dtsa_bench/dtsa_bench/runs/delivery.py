@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.agents.agent import REFUSED
+from dtsa_agent.core.agent import REFUSED
 
 _WHY = {
     "rejected": "rejected (no tag, or one of another key, session or slot)",

@@ -231,7 +231,7 @@ class FlightMetrics:
         if plan is not None and len(plan.goals) > 1:
             if self.completion_slot < 0:
                 return {}
-            direct = plan.way
+            direct = plan.path_length
         else:
             direct = np.sqrt(((self._last - self.scenario.start) ** 2).sum(axis=0))
         return {int(k) + 1: float(direct[k] / path[k]) for k in np.flatnonzero(self._moving) if path[k] > 0.0}

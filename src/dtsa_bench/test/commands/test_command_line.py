@@ -14,28 +14,27 @@ from dtsa_dev.registry import add_commands
 
 import checkout
 from dtsa_bench.commands import cli, registry
-from dtsa_bench.commands.cli import OneLineParser, build_parser
-from dtsa_bench.commands.completion import OF_THE_TOOL
+from dtsa_bench.commands.cli import CHECKOUT_COMMANDS, CommandParser, build_parser
 from dtsa_bench.flights.progress import flight_text
 
 add_commands()
 COMMANDS = list(registry.COMMANDS)
 
 
-def parser_of(command: str) -> OneLineParser:
+def parser_of(command: str) -> CommandParser:
     return build_parser(command)[0].commands[command]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_ends_with_examples_that_the_command_takes(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    parser, module = build_parser(command)
+    parser, chosen = build_parser(command)
     own = parser.commands[command]
-    assert type(own) is OneLineParser
+    assert type(own) is CommandParser
     assert own.prog.split()[-1] == command
     assert not parser.allow_abbrev
     assert not own.allow_abbrev
-    assert module.EXAMPLES
-    for words, text in module.EXAMPLES:
+    assert chosen.examples
+    for words, text in chosen.examples:
         given = shlex.split(words.partition(" >")[0])
         parser.parse_args([command, *given])
         with pytest.raises(SystemExit):
@@ -121,8 +120,8 @@ def test_completion_knows_every_command_and_option_and_results_are_printed_as_js
     assert cli.main(["completion", "zsh"]) == 0
     text = capsys.readouterr().out
     assert text.startswith("#compdef dtsa")
-    assert set(OF_THE_TOOL) == set(checkout.COMMANDS)
-    assert all(f"    {command}:'" in text for command in (*COMMANDS, *OF_THE_TOOL))
+    assert set(CHECKOUT_COMMANDS) == set(checkout.COMMANDS)
+    assert all(f"    {command}:'" in text for command in (*COMMANDS, *CHECKOUT_COMMANDS))
     for command in COMMANDS:
         options = {o for action in parser_of(command)._actions for o in action.option_strings if o.startswith("--")}
         assert all(option in text for option in options), command

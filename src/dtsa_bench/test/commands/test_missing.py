@@ -15,7 +15,7 @@ class Without:
         if name.split(".")[0] == {package!r}:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Without())
-from dtsa_bench import entry
+from dtsa_bench import __main__ as entry
 from dtsa_bench.commands import cli
 words = {words!r}.split()
 sys.exit(entry.recorded_channel() if words == ["recorded_channel"] else cli.main(words))

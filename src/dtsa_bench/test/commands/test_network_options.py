@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cli_helpers import refused
@@ -12,8 +11,8 @@ from cli_helpers import refused
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
-from dtsa_bench.commands import agent, sniff, view
-from dtsa_bench.commands.network_options import read_network_options
+from dtsa_bench.commands.network import read_network_options
+from dtsa_bench.commands.registry import load_command
 from dtsa_bench.runs.options import given_options
 
 SHARED = """\
@@ -30,10 +29,10 @@ priority: 0
 IN_ROS = "/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in SHARED.splitlines())
 
 
-def parsed(words: list[str], module: Any = agent) -> tuple[argparse.Namespace, PortSettings, SwarmConfig]:
+def parsed(words: list[str], command: str = "agent") -> tuple[argparse.Namespace, PortSettings, SwarmConfig]:
     """Options as a command sees them, and what they and the file say."""
     parser = argparse.ArgumentParser()
-    module.add_arguments(parser)
+    load_command(command).add_arguments(parser)
     args = parser.parse_args(words)
     return args, *read_network_options(args)
 
@@ -47,8 +46,8 @@ def test_settings_of_a_file_stand_for_options_and_options_go_before_them(tmp_pat
     assert swarm == wanted
     assert (port.to_dict()["group"], port.to_dict()["interface"]) == ("239.1.2.3:9", "lo")
     assert given_options(args, AgentSettings, "own") == {"id": 3, "priority": 0}
-    for module in (sniff, view):
-        _, port, swarm = parsed(["--swarm", str(path)], module)
+    for command in ("sniff", "view"):
+        _, port, swarm = parsed(["--swarm", str(path)], command)
         assert swarm.slot_ms == 20.0
         assert port.to_dict()["group"] == "239.1.2.3:4567"
 

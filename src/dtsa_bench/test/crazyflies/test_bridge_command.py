@@ -31,8 +31,8 @@ from node_helpers import ros_graph
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.settings import load_swarm
-from dtsa_bench.commands.bridge import simulated
 from dtsa_bench.commands.cli import main
+from dtsa_bench.commands.crazyflies import simulated
 from dtsa_bench.crazyflies.simulated import process as simulated_process
 from dtsa_bench.crazyflies.simulated.process import free_base_port
 

@@ -66,6 +66,9 @@ def test_published_entries_are_whole_and_the_simulator_flies_as_it_did() -> None
     table = LeagueTable(LEAGUE, read_entries(PUBLISHED))
     assert table.complete
     assert len(table.lines()) >= 21
+    starred = {name for rank, name, *_ in table.lines() if rank.endswith("*")}
+    assert {"sense", "dominance"} <= starred
+    assert not starred & {"tdma", "dtsa", "lease", "csma"}
     assert len(PUBLISHED.read_text().splitlines()) <= 1000
 
 
@@ -162,7 +165,7 @@ def made_up(name: str, ages: list[float], crashed: int = 0, bound: bool = False)
     flights = [
         ["crashed" if k < crashed else "completed", 9, 1.0, age, age, 0.01, 0.3, ""] for k, age in enumerate(ages)
     ]
-    return {"name": name, "bound": bound, "flights": {"few": flights}}
+    return {"name": name, "bound": bound, "scheme": {"policy": "tdma"}, "flights": {"few": flights}}
 
 
 def test_the_order_is_by_lost_flights_times_age_and_bounds_have_no_rank() -> None:

@@ -94,7 +94,7 @@ def test_latex_compiles_the_table(swept: dtsa.SweepResult, tmp_path: Path) -> No
 
 def test_the_terminal_shows_every_interval_whatever_its_width(table: SweepTable) -> None:
     wide = table_text(table)
-    assert len(wide.splitlines()) == 5
+    assert len(wide.splitlines()) == 7  # with the legend
     for width in (80, 120):
         text = table_text(table, width)
         assert max(map(len, text.splitlines())) <= width
@@ -154,4 +154,4 @@ def test_the_commit_of_somebody_elses_repository_is_not_ours(tmp_path: Path, mon
     for words in (["init", "-q"], ["add", "own.py"], ["commit", "-q", "-m", "own"]):
         subprocess.run([*git, *words], check=True)
     monkeypatch.setattr(provenance, "_HERE", tmp_path)
-    assert provenance.made_with()["commit"] == "unknown"
+    assert provenance.read_provenance()["commit"] == "unknown"

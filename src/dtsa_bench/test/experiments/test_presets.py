@@ -83,7 +83,7 @@ def test_slots_of_a_crazyflies_radio_are_the_shortest_that_fit() -> None:
         assert run.swarm.slot_ms == math.ceil(round(shortest_ns / 1e4, 6)) / 100
 
 
-def test_the_papers_figures_have_its_settings_and_the_genie_flies_where_access_decides() -> None:
+def test_the_papers_figures_have_its_settings() -> None:
     for name, agents, movers in (("paper-12", 12, [2, 6, 12]), ("paper-18", 18, [2, 10, 18])):
         sweep = spec.load_preset(name)
         assert len(sweep.cells) * len(sweep.seeds) == 270
@@ -94,9 +94,6 @@ def test_the_papers_figures_have_its_settings_and_the_genie_flies_where_access_d
             ("tdma", "hold"), ("tdma", "linear"), ("dtsa", "linear"),
         }  # fmt: skip
         assert {(run.epsilon, run.r_min, run.slot_ms) for run in runs} == {(0.5, 0.3, 10.0)}
-    plain, bounds = (spec.load_preset(name).spec for name in ("access", "access-bounds"))
-    assert bounds.axes["swarm"] == plain.axes["swarm"]
-    assert bounds.base == plain.base
 
 
 @pytest.mark.parametrize("name", ["limits", "idle", "loss", "grid"])

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dtsa_bench.experiments.statistics import bootstrap_mean, median_interval, wilson
+from dtsa_bench.experiments.statistics import bootstrap_mean, wilson
 
 
 @pytest.mark.parametrize(
@@ -21,12 +21,6 @@ def test_wilson_as_published(count: int, total: int, low: float, high: float) ->
     share = wilson(count, total)
     assert (share.low, share.high) == (pytest.approx(low, abs=6e-5), pytest.approx(high, abs=6e-5))
     assert str(share) == f"{count}/{total}"
-
-
-# With fewer than six values no interval holds the median with probability 0.95; the widest is given.
-@pytest.mark.parametrize(("count", "rank"), [(1, 1), (5, 1), (6, 1), (9, 2), (12, 3), (20, 6), (24, 7), (50, 18)])
-def test_the_interval_of_a_median_has_the_ranks_of_the_sign_test(count: int, rank: int) -> None:
-    assert median_interval(list(range(count, 0, -1))) == (rank, count + 1 - rank)
 
 
 @given(st.integers(1, 500), st.data())

@@ -175,7 +175,7 @@ def test_failures_are_rows_with_a_reason_and_are_tried_again(tmp_path: Path, mon
     monkeypatch.setattr(simulate, "simulate", sometimes)
     plan = sweep()
     group = fly(tmp_path, plan).where(policy="dtsa", channel="clear")[0]
-    assert (len(group.rows), group.flown, group.failed, group.crashed.total) == (6, 3, 3, 3)
+    assert (len(group.rows), group.flown_count, group.failed, group.crashed.total) == (6, 3, 3, 3)
     assert group.left_out["failed (RuntimeError: out of luck)"] == 3
     monkeypatch.setattr(simulate, "simulate", real)
     assert all(row["status"] != "failed" for row in fly(tmp_path, plan).rows)

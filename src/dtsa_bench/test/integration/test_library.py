@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import importlib
 import os
 import re
 import shutil
@@ -183,7 +184,7 @@ def test_a_sweep_has_a_row_a_combination_and_a_row_a_flight(swept: dtsa.SweepRes
 
 @pytest.mark.parametrize(("use", "arguments", "field"), [
     (dtsa.simulate, {"agents": -1}, "agents"), (dtsa.simulate, {"color": "red"}, "color"),
-    (dtsa.simulate, {"loss": 2.0}, "loss"), (dtsa.sweep, {}, "sweep"),
+    (dtsa.simulate, {"loss": 2.0}, "loss"), (dtsa.simulate, {"config": 12}, "config"), (dtsa.sweep, {}, "sweep"),
     (dtsa.sweep, {"preset": "loss", "axes": {"loss": [0]}}, "sweep"), (dtsa.sweep, {"preset": "nothing"}, "preset"),
     (dtsa.sweep, {"axes": {"cell": [0]}}, "axes.cell"), (dtsa.sweep, {"axes": {"loss": [0]}, "seeds": 0}, "seeds"),
     (dtsa.sweep, {"axes": {"loss": [0]}, "seeds": []}, "seeds"),
@@ -193,6 +194,16 @@ def test_wrong_settings_are_named_before_anything_flies(use: Any, arguments: dic
     with pytest.raises(dtsa.ConfigError) as caught:
         use(**arguments)
     assert caught.value.field == field
+
+
+def test_the_nearest_name_is_asked_for() -> None:
+    for settings, name in (
+        ({"agnets": 3}, "agents"),
+        ({"policy": "dsta"}, "dtsa"),
+        ({"options": {"v_mx": 1}}, "v_max"),
+    ):
+        with pytest.raises(dtsa.ConfigError, match=f"; did you mean {name}\\?$"):
+            dtsa.simulate(**settings)  # type: ignore[arg-type]
 
 
 def test_plots_are_figures_of_what_they_are_given(flight: dtsa.FlightLog, swept: dtsa.SweepResult, run: Path) -> None:
@@ -213,6 +224,14 @@ def test_plots_are_figures_of_what_they_are_given(flight: dtsa.FlightLog, swept:
         assert figure.axes
     matrix = dtsa.plot_matrix(swept, rows="scheme", columns="loss", y="crashed").axes[0]
     assert (matrix.get_ylabel(), matrix.get_xlabel()) == ("scheme", "loss")
+    own = Figure().subplots(2, 2).ravel()
+    assert dtsa.plot_ages(flight, ax=own[0]) is own[0].figure
+    assert (
+        dtsa.plot_bars(swept, x="scheme", y=["crashed", "age_mean_slots"], series="loss", ax=own[2:]) is own[0].figure
+    )
+    assert [bool(axis.lines or axis.patches) for axis in own] == [True, False, True, True]
+    with pytest.raises(dtsa.ConfigError, match="ax: got '2 axes'; allowed: 1"):
+        dtsa.plot_distances(flight, ax=own[:2])
     with pytest.raises(dtsa.ConfigError, match="x: got 'moving'; allowed: one of the axes loss, scheme"):
         dtsa.plot_bars(swept, x="moving", y="crashed")
     with pytest.raises(dtsa.ConfigError, match="y: got 'height'"):
@@ -245,6 +264,8 @@ dtsa.nothing
 dtsa.Agent("one", dtsa.SwarmConfig(agents=3))
 dtsa.verify("runs/a").okay
 dtsa.sweep("loss", {"loss": [0]})
+dtsa.simulate(agnets=4)
+dtsa.simulate(agents="four")
 """
 
 
@@ -260,7 +281,7 @@ def test_types_work_from_outside(tmp_path: Path) -> None:
     )  # fmt: skip
     errors = [line for line in result.stdout.splitlines() if ": error:" in line]
     assert {line.split(":")[0] for line in errors} == {"bad.py"}, result.stdout
-    assert sorted({int(line.split(":")[1]) for line in errors}) == [4, 5, 6, 7], result.stdout
+    assert sorted({int(line.split(":")[1]) for line in errors}) == [4, 5, 6, 7, 8, 9], result.stdout
 
 
 def test_the_document_is_true(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,6 +294,21 @@ def test_the_document_is_true(run: Path, tmp_path: Path, monkeypatch: pytest.Mon
     assert all(">>>" in block for block in blocks)
     test = doctest.DocTestParser().get_doctest("\n".join(blocks), {}, document.name, str(document), 0)
     assert len(test.examples) > 20
+    run_examples(test)
+
+
+def run_examples(test: doctest.DocTest) -> None:
     failures: list[str] = []
     doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=failures.append)
     assert not failures, "".join(failures)
+
+
+@pytest.mark.parametrize("name", ["_flights", "_plots", "_sweep", "env"])
+def test_examples_of_docstrings_run(name: str) -> None:
+    if name == "env":
+        pytest.importorskip("pettingzoo")
+    module = importlib.import_module(f"dtsa.{name}")
+    tests = [test for test in doctest.DocTestFinder().find(module, extraglobs={"dtsa": dtsa}) if test.examples]
+    assert tests
+    for test in tests:
+        run_examples(test)

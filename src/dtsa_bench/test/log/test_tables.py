@@ -17,7 +17,7 @@ from bag_helpers import flight_bag
 from dtsa_agent.core import REASONS, decode_frame
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.commands.cli import main
-from dtsa_bench.commands.export import TABLES
+from dtsa_bench.commands.recordings import TABLES
 from dtsa_bench.log import tables as module
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.reader import Bag

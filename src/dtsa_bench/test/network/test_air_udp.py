@@ -103,7 +103,7 @@ def test_groups_become_one_flight_on_one_time_line_in_which_all_keep_the_rules(f
     assert found["slots"]["success"] > 20
     assert found["slots"]["collision"] == 0
     assert found["min_distance_m"] > 0.2
-    assert 0 < found["age_mean_slots"] < 4 * CONFIG.agents * CONFIG.heard_every
+    assert 0 < found["age_mean_slots"] < 4 * CONFIG.agents * CONFIG.turn_every
     found = flight.sniffed
     assert found["heard"].keys() == {"cf1", "cf2", "cf3"}
     assert found["frames_judged"] > 10

@@ -15,7 +15,7 @@ import dtsa
 from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
 from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.core.plugins.table import Table
+from dtsa_agent.core.plugins.kinds import Table
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings import GroundStationSettings, SwarmSettings
 from dtsa_agent.stop import Stop

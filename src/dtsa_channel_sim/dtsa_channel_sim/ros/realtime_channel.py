@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
-from dtsa_agent.core.agents.delays import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start

@@ -25,7 +25,7 @@ from dtsa_agent.core.settings.scenario import Scenario
 from dtsa_agent.core.swarm import Bytes, SlotOutcome, Swarm
 
 from .guard import Guarded
-from .table import Table
+from .kinds import Table
 
 _PLUGIN_REASON = REASONS.index("plugin")
 
@@ -80,7 +80,7 @@ class PluginSwarm(Swarm):
         self._ids = [int(index) + 1 for index in self.observer]
         self.tables = [Table(self, row) for row in range(len(self._ids))]  # what each observer knows
         self._outcome = np.zeros(len(self._ids), dtype=np.uint8)  # SlotOutcome of the present slot, collisions apart
-        self._said: dict[int, bytes] = {}  # in this slot, by position in ids
+        self._appended: dict[int, bytes] = {}  # in this slot, by position in ids
         self._own_bytes = self.config.own_bytes
         self._make_parts()
 
@@ -102,10 +102,12 @@ class PluginSwarm(Swarm):
         return Guarded(registry.kind, name, registry.factory(name), self.config, agent)
 
     def _list_speakers(self) -> None:
-        """Notes the parts of each observer that may say something, with the size of it, in the frame's order."""
+        """Note the parts of each observer that may say something, with the size of it, in the frame's order."""
         policy, estimator = self.config.policy_row, self.config.estimator_row
         parts = ((self.policies, policy.own_bytes), (self.estimators, estimator.own_bytes))
-        self._speakers = [[(made[row], size) for made, size in parts if made] for row in range(len(self._ids))]
+        self._speakers = [
+            [(instances[row], size) for instances, size in parts if instances] for row in range(len(self._ids))
+        ]
         self._listen_to_outcome = any(hasattr(part, "slot_over") for row in self._speakers for part, _ in row)
 
     def decide(self, slot: int) -> None:
@@ -133,17 +135,17 @@ class PluginSwarm(Swarm):
     def emit(self, slot: int) -> tuple[int, ...]:
         senders = super().emit(slot)
         if self._own_bytes:
-            self._said = {index: b"".join(self._say(index, slot)) for index in senders}
+            self._appended = {index: b"".join(self._own_data(index, slot)) for index in senders}
         return senders
 
-    def _say(self, index: int, slot: int) -> Iterator[bytes]:
+    def _own_data(self, index: int, slot: int) -> Iterator[bytes]:
         for part, size in self._speakers[index]:
             if size:
-                yield part.bytes_said(part.say(self.tables[index], slot), size)
+                yield part.checked_bytes(part.say(self.tables[index], slot), size)
 
     def frame(self, local_index: int) -> bytes:
         data = self._encoded(local_index)
-        return self._sealed(data + self._said[local_index] if data and self._own_bytes else data)
+        return self._sealed(data + self._appended[local_index] if data and self._own_bytes else data)
 
     def _receive(self, slot: int, frame: bytes, mask: Bytes | None) -> bool:
         end = max(0, len(frame) - self._own_bytes)
@@ -176,11 +178,11 @@ class PluginSwarm(Swarm):
     def end(self, slot: int, collided: Bytes | None = None) -> None:
         super().end(slot, collided)
         if self._listen_to_outcome:
-            self._tell_outcome(slot, collided)
+            self._report_outcome(slot, collided)
         if self.estimators:
             self.estimate(slot + 1)  # what the metrics compare with the truth
 
-    def _tell_outcome(self, slot: int, collided: Bytes | None) -> None:
+    def _report_outcome(self, slot: int, collided: Bytes | None) -> None:
         self._outcome[np.flatnonzero(self.sends & (self.frame_length > 0))] = SlotOutcome.FRAME
         for row, table in enumerate(self.tables):
             outcome = SlotOutcome(int(self._outcome[row]))

@@ -31,19 +31,19 @@ class Guarded:
 
     def __init__(self, kind: str, name: str, factory: Callable[..., Any], *arguments: object) -> None:
         self.name = f"{kind} {name}"
-        self.made = _guarded(self.name, factory)(*arguments)
+        self.instance = _guarded(self.name, factory)(*arguments)
         needed = [_NEEDED[kind]]
         if kind == "policy":
             needed = [next((text for text in _FOR_COMPARISON if _has(factory, text)), needed[0])]
         if kind != "avoider" and getattr(factory, "own_bytes", None):
             needed += _SPEAKS
-        missing = [text for text in needed if not _has(self.made, text)]
+        missing = [text for text in needed if not _has(self.instance, text)]
         if missing:
-            raise PluginError(self.name, f"{type(self.made).__name__} has no method {' and '.join(missing)}")
+            raise PluginError(self.name, f"{type(self.instance).__name__} has no method {' and '.join(missing)}")
 
     def __getattr__(self, method: str) -> Callable[..., Any]:
         """A method of the instance, guarded; made at the first call."""
-        call = _guarded(f"{self.name}, {method}", getattr(self.made, method))
+        call = _guarded(f"{self.name}, {method}", getattr(self.instance, method))
         setattr(self, method, call)
         return call
 
@@ -58,7 +58,7 @@ class Guarded:
         except Exception:
             fault = f"gave {shown(answer)} in slot {slot}; allowed: a list of the ids that send"
             raise PluginError(f"{self.name}, senders", fault) from None
-        return [self._whole(one, "senders", slot, 1, agents, "1") for one in named]
+        return [self._whole(agent, "senders", slot, 1, agents, "1") for agent in named]
 
     def _whole(self, answer: object, method: str, slot: int, low: int, high: int, least: str) -> int:
         try:
@@ -70,11 +70,11 @@ class Guarded:
             raise PluginError(f"{self.name}, {method}", fault)
         return number
 
-    def bytes_said(self, answer: object, size: int) -> bytes:
+    def checked_bytes(self, answer: object, size: int) -> bytes:
         """What ``say`` has answered: as many bytes as it has declared."""
         if not isinstance(answer, (bytes, bytearray)) or len(answer) != size:
-            given = f"{len(answer)} bytes" if isinstance(answer, (bytes, bytearray)) else shown(answer)
-            raise PluginError(f"{self.name}, say", f"gave {given}, declared {size}")
+            size_text = f"{len(answer)} bytes" if isinstance(answer, (bytes, bytearray)) else shown(answer)
+            raise PluginError(f"{self.name}, say", f"gave {size_text}, declared {size}")
         return bytes(answer)
 
     def commanded(self, answer: Any, slot: int) -> tuple[float, ...]:
@@ -89,13 +89,13 @@ class Guarded:
         return velocity
 
     def estimated(self, *arrays: NDArray[np.float64], slot: int) -> None:
-        """Checks that what ``estimate`` has written is finite."""
+        """Check that what ``estimate`` has written is finite."""
         if not all(np.isfinite(array).all() for array in arrays):
             raise PluginError(f"{self.name}, estimate", f"wrote a number that is not finite in slot {slot}")
 
 
-def _has(thing: object, method: str) -> bool:
-    return callable(getattr(thing, method.partition("(")[0], None))
+def _has(part: object, method: str) -> bool:
+    return callable(getattr(part, method.partition("(")[0], None))
 
 
 def _guarded(part: str, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from dtsa_agent.core.frame import ExtendedFrame, Frame
 from dtsa_agent.core.reference.lease.decide import decide as decide_lease
-from dtsa_agent.core.reference.lease.issue import Said, say
+from dtsa_agent.core.reference.lease.issue import TurnAnnouncement, announce_turns
 from dtsa_agent.core.reference.lease.listen import end_slot, listen
 from dtsa_agent.core.reference.lease.memory import Memory
 
@@ -20,8 +20,7 @@ from .arithmetic import ZERO, Vector, minus, norm
 from .frame import PROFILE_EXTENDED, WRONG_HEADER, Refused, decode, encode
 from .frame_extended import SECTION_BYTES, SECTIONS, decode_extended, encode_extended
 from .policies import NOBODY, Choice, Weights
-from .rules import EXTENDED, LEAVES, OFF, ON, PAPER, Rules
-from .table import Table
+from .table import EXTENDED, LEAVES, OFF, ON, PAPER, Rules, Table
 
 
 @dataclass(slots=True)
@@ -80,15 +79,15 @@ class Agent:
         own = Frame(self.index + 1, rules.slot_on_air(slot), c_r, self.position, self.velocity, intent)
         if rules.profile != EXTENDED:
             return encode(own, rules.position_step)
-        said = Said()
+        announcement = TurnAnnouncement()
         if rules.policy == "lease":
             leaves = self.present == LEAVES
-            said = say(self.memory, self.index, self.table, slot, self.velocity, self.final, leaves)
-        used = -(-len(said.leases) // SECTION_BYTES) + bool(said.relay) + bool(said.far)
+            announcement = announce_turns(self.memory, self.index, self.table, slot, self.velocity, self.final, leaves)
+        used = -(-len(announcement.leases) // SECTION_BYTES) + bool(announcement.relay) + bool(announcement.far)
         carried = gossip.collect(self.table, self.index, slot, SECTIONS - used, rules) if rules.gossip else ()
         frame = ExtendedFrame(
-            own, said.c_s, said.leaving, self.memory.probation, carried,
-            said.leases, said.relay, said.far, said.far_lessee,
+            own, announcement.c_s, announcement.leaving, self.memory.probation, carried,
+            announcement.leases, announcement.relay, announcement.far, announcement.far_lessee,
         )  # fmt: skip
         return encode_extended(frame, rules.position_step)
 
@@ -141,7 +140,7 @@ def parse(data: bytes, slot: int, rules: Rules) -> tuple[Frame | ExtendedFrame, 
     sampled = slot - late
     if sampled < 0 or own.slot != rules.slot_on_air(sampled) or own.sender > rules.agents:
         raise Foreign
-    if isinstance(frame, ExtendedFrame) and not gossip.known(frame, sampled, rules):
+    if isinstance(frame, ExtendedFrame) and not gossip.fits_swarm(frame, sampled, rules):
         raise Foreign
     return frame, sampled
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from .arithmetic import Vector
 
 if TYPE_CHECKING:
-    from .rules import Rules
-    from .table import Row
+    from .table import Row, Rules
 
 DECAY_STEPS = 4096  # beyond this many control periods a vehicle has settled at its command
 
@@ -39,12 +38,12 @@ def intent(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Ve
     ago = 0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.steps + step
     powers, ways = decay_table(rules.tau, rules.dt)
     at = max(0, min(ago, DECAY_STEPS - 1))  # a frame of the next slot may be heard before this one is over
-    q, way = powers[at], ways[at]
+    q, distance = powers[at], ways[at]
     position, velocity = [], []
     for axis in range(3):
         c = row.intent[axis]
         d = row.velocity[axis] - c
-        position.append(row.position[axis] + c * age + d * way)
+        position.append(row.position[axis] + c * age + d * distance)
         velocity.append(c + d * q)
     return (position[0], position[1], position[2]), (velocity[0], velocity[1], velocity[2])
 
@@ -57,12 +56,12 @@ def decay_table(tau: float, dt: float) -> tuple[tuple[float, ...], tuple[float, 
     """
     q = max(0.0, 1.0 - dt / tau)
     powers, ways = [], []
-    power, way = 1.0, 0.0
+    power, distance = 1.0, 0.0
     for _ in range(DECAY_STEPS):
         powers.append(power)
-        ways.append(way)
+        ways.append(distance)
         power *= q
-        way += dt * power
+        distance += dt * power
     return tuple(powers), tuple(ways)
 
 

@@ -103,5 +103,5 @@ def tag(key: bytes, session: int, slot: int, data: bytes) -> bytes:
     A truncated code over session, slot and frame: BLAKE2s with a key. The slot is the one in which it is sent, not what
     the frame says; by the person tags of other software, or of another version of this one, are none of ours.
     """
-    said = session.to_bytes(8, "little") + slot.to_bytes(8, "little") + data
-    return blake2s(said, key=key, digest_size=4, person=b"dtsa v1").digest()
+    covered = session.to_bytes(8, "little") + slot.to_bytes(8, "little") + data
+    return blake2s(covered, key=key, digest_size=4, person=b"dtsa v1").digest()

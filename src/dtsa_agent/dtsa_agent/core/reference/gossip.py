@@ -5,8 +5,7 @@ from __future__ import annotations
 from dtsa_agent.core.frame import ExtendedFrame, Frame, Gossip
 
 from .frame_extended import GOSSIP_AGE_MAX, OPEN, SECTIONS, gossip_fits
-from .rules import Rules
-from .table import Table
+from .table import Rules, Table
 
 
 def collect(table: Table, self_index: int, slot: int, room: int, rules: Rules) -> tuple[Gossip, ...]:
@@ -59,7 +58,7 @@ def confirm(table: Table, sampled: int, entry: Gossip, rules: Rules) -> None:
         )
 
 
-def known(frame: ExtendedFrame, slot: int, rules: Rules) -> bool:
+def fits_swarm(frame: ExtendedFrame, slot: int, rules: Rules) -> bool:
     """Whether a frame speaks of agents of this swarm only, and gives turns away in its sender's own turn only."""
     n, own_turn = rules.agents, slot >= 0 and slot % rules.agents == frame.own.sender - 1
     lessees = (*frame.leases, *(lessee for _, lessee in frame.relay))

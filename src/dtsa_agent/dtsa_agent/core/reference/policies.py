@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from . import estimators
 from .arithmetic import INVERSE_PI, Vector, arcsin, dot, minus, mix64, share_of, sum_in_lanes
-from .rules import Rules
-from .table import Table
+from .table import Rules, Table
 
 
 @dataclass(frozen=True, slots=True)

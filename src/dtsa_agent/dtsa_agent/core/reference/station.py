@@ -2,7 +2,7 @@
 
 Every frame shows when its sender's slot 0 began: its *origin*. An agent has an origin of its own and moves it a little
 towards those that it hears. A frame whose origin is off by more than the link is trusted with shows another time; see
-:meth:`Station._gives_way` for whose time counts where two groups meet. An agent flies only while it hears, and is heard
+:meth:`Station._yields_to` for whose time counts where two groups meet. An agent flies only while it hears, and is heard
 by, a quorum of the others. All times are ns of the own clock; the same in C: ``libdtsa/station``.
 """
 
@@ -19,7 +19,7 @@ from typing import NamedTuple
 from .agent import Agent, Foreign, Receiver, hear, parse
 from .arithmetic import mix64
 from .frame import Refused, decode
-from .rules import EXTENDED, LEAVES, OFF, Rules
+from .table import EXTENDED, LEAVES, OFF, Rules
 
 Datagram = bytes
 Ns = int  # ns, own clock
@@ -114,8 +114,8 @@ class Counts:
 
 def centred(a: int, b: int) -> int:
     """``a`` modulo ``b``, from -b/2 to b/2."""
-    rest = a % b
-    return rest - b if rest > b // 2 else rest
+    remainder = a % b
+    return remainder - b if remainder > b // 2 else remainder
 
 
 def limited(value: int, limit: int) -> int:
@@ -194,8 +194,8 @@ class Station:
         if not 1 <= sender <= self.rules.agents:
             return UNKNOWN_AGENT
         if self.settings.key:
-            frame, given = frame[:-TAG_LENGTH], frame[-TAG_LENGTH:]
-            if self._tag(slot, frame + times) != given:
+            frame, tag = frame[:-TAG_LENGTH], frame[-TAG_LENGTH:]
+            if self._tag(slot, frame + times) != tag:
                 return REJECTED
         if slot >= self.cycle:
             return NO_FRAME
@@ -257,7 +257,7 @@ class Station:
         size = (abs(median) + 1) // 2  # half away from zero: both directions weigh the same
         return size if median >= 0 else -size
 
-    def _gives_way(self, origin_ns: Ns, now: Ns) -> bool:
+    def _yields_to(self, origin_ns: Ns, now: Ns) -> bool:
         """Whether the time that a frame shows is taken over.
 
         That is so when most of all agents heard lately are in it; when it is the earlier one and half of them are, or
@@ -267,11 +267,11 @@ class Station:
         recent = [p for p in self.peers if self._is_recent(p, p.heard_ns, now)]
         every = 1 + len(recent)
         here = 1 + sum(self._is_same(p.origin_ns, self.origin_ns) for p in recent)
-        there = sum(p.steady and self._is_same(p.origin_ns, origin_ns) for p in recent)
+        in_other_time = sum(p.steady and self._is_same(p.origin_ns, origin_ns) for p in recent)
         earlier = self._apart(origin_ns, self.origin_ns) < 0
-        if 2 * there > every or (earlier and (self.state == ALONE or 2 * there == every)):
+        if 2 * in_other_time > every or (earlier and (self.state == ALONE or 2 * in_other_time == every)):
             return True
-        if not there:
+        if not in_other_time:
             return False
         if now - self.in_step_ns > self.patience_ns:
             return True
@@ -282,7 +282,7 @@ class Station:
         self.earlier_ns = now
         return now - self.earlier_since > self.patience_ns
 
-    def _take_over(self, origin_ns: Ns, now: Ns) -> None:
+    def _adopt_time(self, origin_ns: Ns, now: Ns) -> None:
         self.offsets.clear()
         self.origin_ns, self.in_step_ns, self.earlier_ns, self.state = origin_ns, now, None, JOINED
         for p in self.peers:
@@ -292,7 +292,7 @@ class Station:
         p.steady = p.heard_ns is not None and self._is_same(p.origin_ns, origin_ns)
         p.heard_ns, p.origin_ns = arrival, origin_ns
         if self.state == LISTENING:
-            self._take_over(origin_ns, arrival)
+            self._adopt_time(origin_ns, arrival)
             return RESTARTED
         apart, near = self._apart(origin_ns, self.origin_ns), self._is_near(origin_ns)
         if near:
@@ -304,11 +304,11 @@ class Station:
             return IN_STEP
         if self.settings.keeps_time:
             return IN_STEP
-        if not self._gives_way(origin_ns, arrival):
+        if not self._yields_to(origin_ns, arrival):
             if not near and p.steady:  # it has gone to another time, and hears this agent no more
                 p.near_ns = None
             return IN_STEP if near else OTHER
-        self._take_over(self.origin_ns + apart if near else origin_ns, arrival)
+        self._adopt_time(self.origin_ns + apart if near else origin_ns, arrival)
         return SHIFTED if near else RESTARTED
 
     # How long frames are under way. What i hears of j comes later by d + o_j - o_i, what j hears of i by d + o_i - o_j.
@@ -357,7 +357,7 @@ class Station:
         if not most:
             return
         p.unnamed += 1
-        hears = said_of(self.settings.id, [k for k, _ in d.names if k], most)
+        hears = names_hear(self.settings.id, [k for k, _ in d.names if k], most)
         if not hears and most == 1 and p.unnamed > CYCLES * (self.rules.agents - 1):
             hears = -1
         p.hears_us = hears or p.hears_us
@@ -387,14 +387,14 @@ class Station:
 
     def _close_slot(self) -> None:
         if self.running:
-            self.agent.remember_own(self.slot, self.said)
+            self.agent.remember_own(self.slot, self.pending)
             self.agent.end(self.slot)
         self.running, self.frame = False, b""
 
     def _restart(self, now: Ns) -> None:
         """From the next slot on it takes part, knowing nothing."""
         if self.frame:
-            self.said = b""
+            self.pending = b""
         self._close_slot()
         self.slot = self._slot_at(now + self.lead_ns)
         self.first, self.newcomer, self.hovers = self.slot + 1, True, HOVERS_NEW
@@ -443,16 +443,16 @@ class Station:
         if self.leaving and not self.gone:  # its last frame did not leave
             self.agent.present = LEAVES
         chosen = self.agent.decide(slot).index + 1
-        self.said = self.frame = self.agent.frame(slot) if self.agent.sends else b""
+        self.pending = self.frame = self.agent.frame(slot) if self.agent.sends else b""
         if self.frame and self._leaves_out(slot, now):
-            self.said = self.frame = b""
+            self.pending = self.frame = b""
         self.running, self.awaits = True, chosen not in (0, self.settings.id)
         early, self.early = self.early, []
-        for one in early:
-            if one[0] > slot:
-                self.early.append(one)
+        for entry in early:
+            if entry[0] > slot:
+                self.early.append(entry)
             else:
-                self._hear_frame(one[0], one[2])
+                self._hear_frame(entry[0], entry[2])
 
     def receive(self, data: Datagram, arrival: Ns) -> int:
         """Accepts a datagram, or says why not. Anything may be handed in."""
@@ -508,7 +508,7 @@ class Station:
         return following - (self.latest_lead_ns if must_decide else self.lead_ns)
 
     def step(self, now: Ns) -> tuple[Ns, Datagram]:
-        """Does one thing that is due; when to call again (not after now: at once), and what to send now."""
+        """Do one thing that is due; when to call again (not after now: at once), and what to send now."""
         datagram, due = b"", self._due_ns(now)
         if now < due:
             return due, b""
@@ -527,7 +527,7 @@ class Station:
 
     def _send(self, late_ns: int, now: Ns) -> Datagram:
         if late_ns > self.latest_send_ns:  # it would disturb the next turn
-            self.frame = self.said = b""
+            self.frame = self.pending = b""
             return b""
         datagram = self._write(late_ns, now)
         self.gone = self.leaving and self.frame[2] == LEAVING
@@ -540,7 +540,7 @@ class Station:
         if taken:
             self.refused_since = None
             return
-        self.said = b""
+        self.pending = b""
         if self.refused_since is None:
             self.refused_since = now
 
@@ -554,7 +554,7 @@ class Station:
             self.agent.restart()
 
 
-def said_of(agent: int, names: Sequence[int], most: int) -> int:
+def names_hear(agent: int, names: Sequence[int], most: int) -> int:
     """Whether the sender of a list of names hears an agent: 1, -1, or 0: the list does not tell."""
     if agent in names:
         return 1

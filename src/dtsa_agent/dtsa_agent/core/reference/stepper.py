@@ -24,8 +24,7 @@ from .agent import Agent, Foreign, Receiver, hear, parse
 from .arithmetic import Vector
 from .estimators import ESTIMATORS
 from .lease.memory import DEAF
-from .rules import Rules
-from .table import Table
+from .table import Rules, Table
 
 
 def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
@@ -58,7 +57,7 @@ class ReferenceSwarm(Swarm):
             self._publish(place)
 
     def decide(self, slot: int) -> None:
-        self._look()
+        self._read_arrays()
         for place, agent in enumerate(self.agents):
             choice = agent.decide(slot)
             self.chosen[place], self.reason[place] = choice.index + 1, REASONS.index(choice.reason)
@@ -68,7 +67,7 @@ class ReferenceSwarm(Swarm):
                     array[place] = weights
 
     def emit(self, slot: int) -> tuple[int, ...]:
-        self._look()
+        self._read_arrays()
         for place, agent in enumerate(self.agents):
             try:
                 data = agent.frame(slot) if agent.sends else b""
@@ -110,7 +109,7 @@ class ReferenceSwarm(Swarm):
         except (RemoteProtocolError, Foreign) as error:
             self.rejects[int(isinstance(error, Foreign))] += 1
             return False
-        self._look()
+        self._read_arrays()
         extended = self.config.extended
         sender = data[1] if extended else int.from_bytes(data[1:3], "little")
         reached = [
@@ -125,7 +124,7 @@ class ReferenceSwarm(Swarm):
         return True
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
-        self._look()
+        self._read_arrays()
         for place, agent in enumerate(self.agents):
             agent.remember_own(slot, self.frame(place))
             agent.end(slot)
@@ -139,13 +138,13 @@ class ReferenceSwarm(Swarm):
     def lease_status(self, local_index: int) -> dict[str, Any]:
         memory, index = self.agents[local_index].memory, int(self.local[local_index])
         others = [k for k in range(self.rules.agents) if k != index] if memory.started else []
-        alive = 1 + sum(map(memory.alive, others)) if memory.started else self.rules.agents
+        alive = 1 + sum(map(memory.is_connected, others)) if memory.started else self.rules.agents
         return {
             "probation": memory.probation, "deaf": memory.silence > DEAF, "woke": memory.woke if memory.started else 0,
             "alive": alive, "absent": sum(memory.absent(k, memory.now) for k in others), "silent_slots": memory.silence,
         }  # fmt: skip
 
-    def _look(self) -> None:
+    def _read_arrays(self) -> None:
         """Agents take over what scenario and vehicles have written into the arrays."""
         goals = _vectors(self.known_goal) if self.rules.targets_known else None
         states = (_vectors(planes) for planes in (self.position, self.velocity, self.command, self.goal))
@@ -156,7 +155,7 @@ class ReferenceSwarm(Swarm):
             agent.sends = bool(self.sends[place])
 
     def _publish(self, place: int) -> None:
-        """Writes a table into the arrays."""
+        """Write a table into the arrays."""
         table = self.agents[place].table
         for name in ("position", "velocity", "intent"):
             getattr(self, f"sent_{name}")[place] = np.array([getattr(row, name) for row in table.rows]).T

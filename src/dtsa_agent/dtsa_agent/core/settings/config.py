@@ -181,14 +181,20 @@ class SwarmConfig(Settings):
         """Check that plug-ins declare the options with a dot, also those of plug-ins that do not fly."""
         for key in self.options:
             owner = key.rpartition(".")[0]
-            flying = [one for one in _REGISTRIES if getattr(self, one.kind) == owner and owner not in one.rows]
+            flying = [
+                registry
+                for registry in _REGISTRIES
+                if getattr(self, registry.kind) == owner and owner not in registry.rows
+            ]
             if not owner or (not flying and key in _ACCEPTED):
                 continue
-            owners = flying or [one for one in _REGISTRIES if owner in one.plug_in_names()]
+            owners = flying or [registry for registry in _REGISTRIES if owner in registry.plug_in_names()]
             if not owners:
-                names = ", ".join(sorted({name for one in _REGISTRIES for name in one.plug_in_names()}))
+                names = ", ".join(sorted({name for registry in _REGISTRIES for name in registry.plug_in_names()}))
                 raise ConfigError("options", key, f"the name of a plug-in before the dot; {names}")
-            declared = {f"{owner}.{option}" for one in owners for option in _declared(owner, one.factory(owner))}
+            declared = {
+                f"{owner}.{option}" for registry in owners for option in _declared(owner, registry.factory(owner))
+            }
             if key not in declared:
                 nothing = f"none: {owner} declares no options (class attribute options)"
                 raise ConfigError("options", key, ", ".join(sorted(declared)) or nothing)
@@ -263,7 +269,7 @@ class SwarmConfig(Settings):
         return max(self.open_every, self.agents // 5) if self.open_every else 0
 
     @property
-    def heard_every(self) -> int:
+    def turn_every(self) -> int:
         """Rounds within which each agent that moves sends: M; 5 with policies that have no anchors."""
         return self.anchor_every if self.policy_row.probation else 5
 

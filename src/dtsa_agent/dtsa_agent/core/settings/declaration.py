@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from dtsa_agent.core.errors import ConfigError, range_text
+from dtsa_agent.core.errors import UNKNOWN, ConfigError, range_text
 
 #: The default of a setting that has none.
 REQUIRED: Any = dataclasses.MISSING
@@ -218,7 +218,7 @@ class Settings:
 
     @classmethod
     def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
-        """Builds settings from plain values by name; those that are left out keep their defaults.
+        """Build settings from plain values by name; those that are left out keep their defaults.
 
         :raises ConfigError: for unknown names and values that are not allowed.
         """
@@ -227,23 +227,23 @@ class Settings:
 
 def build(cls: type[T], values: Mapping[str, Any]) -> T:
     """What :meth:`Settings.from_dict` does, for classes that read their values in a way of their own first."""
-    known = {spec.name: spec for spec in settings_of(cls)}
-    given = dict(names_with_values(values, "settings"))
-    for name, value in given.items():
-        if name not in known:
-            raise ConfigError(str(name), value, "one of the settings " + ", ".join(known))
-        section = known[name].section
+    specs = {spec.name: spec for spec in settings_of(cls)}
+    arguments = dict(names_with_values(values, "settings"))
+    for name, value in arguments.items():
+        if name not in specs:
+            raise ConfigError(str(name), value, UNKNOWN + ", ".join(specs))
+        section = specs[name].section
         if section and isinstance(value, Mapping):
             with named(name):
-                given[name] = section.from_dict(value)
-    for spec in known.values():
-        if spec.required and spec.name not in given:
+                arguments[name] = section.from_dict(value)
+    for spec in specs.values():
+        if spec.required and spec.name not in arguments:
             raise ConfigError(spec.name, None, spec.allowed)
-    return cls(**given)
+    return cls(**arguments)
 
 
 def check(config: Any) -> None:
-    """Checks all settings of an object, in its ``__post_init__``, and stores what :meth:`Setting.check` gives."""
+    """Check all settings of an object, in its ``__post_init__``, and store what :meth:`Setting.check` gives."""
     for spec in settings_of(type(config)):
         if not spec.custom:
             value = getattr(config, spec.name)
@@ -293,7 +293,7 @@ def _checked_values(value: object, name: str) -> dict[str, float]:
 
 
 def parse_values(text: str) -> dict[str, float]:
-    """Reads ``name=number, name=number``; ValueError: it is not of this form."""
+    """Read ``name=number, name=number``; ValueError: it is not of this form."""
     result = {}
     for part in filter(None, (piece.strip() for piece in text.split(","))):
         name, equals, value = part.partition("=")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import UNKNOWN, ConfigError
 from dtsa_agent.core.kernel import NAMES, ffi, lib, memory
 from dtsa_agent.core.registry import Registry
 
@@ -66,7 +66,7 @@ class VehicleParams(Settings):
     a_max: float = setting(2.0, "largest acceleration (norm)", unit="m/s^2", minimum=0.01, maximum=200)
 
     def step(self, dt: float, position: Array, velocity: Array, command: Array) -> None:
-        """Moves vehicles, (3,) or (3, N), on by dt s, not longer than ``tau``: position and velocity in place."""
+        """Move vehicles, (3,) or (3, N), on by dt s, not longer than ``tau``: position and velocity in place."""
         p, v, c = (np.array(values, dtype=np.float64, order="C") for values in (position, velocity, command))
         if not p.shape == v.shape == c.shape or p.shape[0] != 3:
             raise ValueError(f"position, velocity, command: shapes {p.shape}, {v.shape} and {c.shape}")
@@ -146,7 +146,7 @@ def flight_model(name: str, options: Mapping[str, float] | None = None) -> Fligh
         if "." in key:
             continue
         if key not in owners:
-            raise ConfigError(f"options.{key}", value, "one of the values " + ", ".join(owners))
+            raise ConfigError(f"options.{key}", value, UNKNOWN + ", ".join(owners))
         groups[owners[key]][key] = value
     return dataclasses.replace(
         model,

@@ -55,7 +55,7 @@ class Plan:
     r_min: float  # m, closer than this an agent has arrived
 
     @property
-    def way(self) -> Array:
+    def path_length(self) -> Array:
         """Length of the straight lines from goal to goal, (N,), m."""
         points = np.concatenate((self.start[None], self.goals))
         return np.asarray(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)).sum(axis=0))
@@ -71,7 +71,7 @@ class Course:
     def __init__(self, plan: Plan, local: NDArray[np.int32]) -> None:
         self._start, self._moving, self._legs = plan.start[:, local], plan.moving[local], len(plan.goals)
         self.leg = np.full(len(local), -1, dtype=np.int64)  # index of the present goal, -1: waits for its first slot
-        self._since = self.leg.copy()  # slot of arrival at the present goal, -1: under way
+        self._since = self.leg.copy()  # slot of arrival at the present goal, -1: under lengths
         self.changed = self.leg.copy()  # slot in which that became its goal
         self.goal: Array = np.ascontiguousarray(self._start)  # (3, L) m, frame map, where each flies to now
         arrays = {
@@ -80,9 +80,9 @@ class Course:
             "pause": np.array(plan.pause, dtype=np.int64), "moving": np.array(plan.moving, dtype=np.uint8),
             "leg": self.leg, "since": self._since, "changed": self.changed, "goal": self.goal,
         }  # fmt: skip
-        self._lent = {name: memory(array) for name, array in arrays.items()}
+        self._borrowed = {name: memory(array) for name, array in arrays.items()}
         sizes = {"n": plan.start.shape[1], "count": len(local), "goal_count": self._legs, "r_min": plan.r_min}
-        self.kernel = ffi.new("course *", {**sizes, **self._lent})
+        self.kernel = ffi.new("course *", {**sizes, **self._borrowed})
 
     def reset(self) -> None:
         """Back to the start of the flight."""
@@ -100,7 +100,7 @@ class Course:
         return np.asarray(~self._moving | (self.leg == self._legs - 1))
 
     def advance(self, slot: int, position: Array) -> bool:
-        """Takes note of where the agents are, (3, L) m, when a slot begins; returns whether any goal has changed."""
+        """Note where the agents are, (3, L) m, when a slot begins; returns whether any goal has changed."""
         if position.shape != self.goal.shape:
             raise ValueError(f"position: shape {position.shape}")
         return bool(lib.course_advance(self.kernel, slot, memory(np.ascontiguousarray(position, dtype=np.float64))))
@@ -126,7 +126,7 @@ class Scenario:
         return None if self.plan is None else Course(self.plan, local)
 
     def advance(self, slot: int, swarm: Any) -> None:
-        """Sets goals and activity of a :class:`~dtsa_agent.core.swarm.Swarm` for the slot that is about to begin.
+        """Set goals and activity of a :class:`~dtsa_agent.core.swarm.Swarm` for the slot that is about to begin.
 
         Only the own state of each agent is looked at.
         """
@@ -155,7 +155,7 @@ def make_scenario(config: SwarmConfig) -> Scenario:
     target, moving = places.copy(), np.zeros(count, dtype=np.bool_)
     if config.scenario == "streams":
         moving[: config.movers] = True
-        target[:, : config.movers] += _stream_way(config)
+        target[:, : config.movers] += _stream_lengths(config)
     else:
         for index in chosen[: config.movers // 2]:
             a, b = pairs[index]
@@ -220,8 +220,8 @@ def _planned(config: SwarmConfig, plain: Scenario, random: np.random.Generator) 
         if config.pause_slots:
             begin[moving] = random.integers(0, config.pause_slots, int(moving.sum()))
     plan = Plan(plain.start, np.ascontiguousarray(goals), begin, pause, moving, config.r_min)
-    known = config.scenario == "staggered"
-    return Scenario(plain.start, np.ascontiguousarray(goals[-1]), moving, plan, known)
+    goals_known = config.scenario == "staggered"
+    return Scenario(plain.start, np.ascontiguousarray(goals[-1]), moving, plan, goals_known)
 
 
 WAYPOINT_GAP = 0.9  # m, between a waypoint and everybody's last goal, and among the movers' n-th waypoints
@@ -232,18 +232,18 @@ def _waypoints(config: SwarmConfig, plain: Scenario, random: np.random.Generator
     ax, ay, _ = half_axes(config)
     points = np.repeat(plain.start[None], config.stops, axis=0)
     for stop in range(config.stops):
-        taken = list(plain.target.T)
+        occupied = list(plain.target.T)
         for k in np.flatnonzero(plain.moving):
             gap = WAYPOINT_GAP
             while True:
                 angle, r = 2 * math.pi * random.random(), math.sqrt(random.random())
                 z = random.uniform(-0.5, 0.5)
                 point = np.round([ax * r * math.cos(angle), ay * r * math.sin(angle), z], 6)
-                if min(float(np.sqrt(((point - other) ** 2).sum())) for other in taken) >= gap:
+                if min(float(np.sqrt(((point - other) ** 2).sum())) for other in occupied) >= gap:
                     break
                 gap *= 0.998  # a crowded room has no better place
             points[stop, :, k] = point
-            taken.append(point)
+            occupied.append(point)
     return points
 
 
@@ -253,14 +253,14 @@ def _stream_size(config: SwarmConfig) -> tuple[int, float]:
     return math.ceil(math.sqrt(half)), max(1.0, flight_model(config.avoider, config.options).spacing)
 
 
-def _stream_way(config: SwarmConfig) -> Array:
+def _stream_lengths(config: SwarmConfig) -> Array:
     """How far each mover of two crossing streams flies, (3, movers), m: one along x, the other along y."""
     rows, gap = _stream_size(config)
-    way = np.zeros((3, config.movers))
+    lengths = np.zeros((3, config.movers))
     length = 2 * ((rows + 1) * gap + 2.0)
-    way[0, : config.movers // 2] = length
-    way[1, config.movers // 2 :] = length
-    return way
+    lengths[0, : config.movers // 2] = length
+    lengths[1, config.movers // 2 :] = length
+    return lengths
 
 
 def _streams(config: SwarmConfig) -> tuple[Array, NDArray[np.int64]]:
@@ -274,10 +274,10 @@ def _streams(config: SwarmConfig) -> tuple[Array, NDArray[np.int64]]:
     along = -length / 2 - depth + (rows - 1) * gap / 2
     places[0, :half], places[1, :half] = along[:half], lane[:half]
     places[0, half:movers], places[1, half:movers] = lane, along
-    rest = config.agents - movers
-    if rest:
-        radius = max(length / 2 + rows * gap + 1.0, gap * rest / (2 * math.pi))
-        angle = 2 * np.pi * np.arange(rest) / rest
+    hovering = config.agents - movers
+    if hovering:
+        radius = max(length / 2 + rows * gap + 1.0, gap * hovering / (2 * math.pi))
+        angle = 2 * np.pi * np.arange(hovering) / hovering
         places[0, movers:], places[1, movers:] = radius * np.cos(angle), radius * np.sin(angle)
     return places, np.full(config.agents, -1, dtype=np.int64)
 

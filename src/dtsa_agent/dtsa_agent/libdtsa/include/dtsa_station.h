@@ -48,9 +48,8 @@ typedef struct dtsa_station_settings {
     double position_step;         /* m */
     int64_t slot_ns;
     uint64_t seed;
-    int64_t moving_slots, resting_slots; /* after which an agent counts as silent; 0: max(2 M N, 0.5
-                                            s), 6 K M N */
-    int quorum;          /* others to hear and be heard by: a number, or DTSA_QUORUM_.. */
+    int sends;  /* DTSA_SENDS_..: after which time without a frame an agent counts as silent */
+    int quorum; /* others to hear and be heard by: a number, or DTSA_QUORUM_.. */
     double quorum_share; /* of the others, 0 to 1 */
     const uint8_t *key;  /* NULL: frames carry no tag */
     int key_length;
@@ -63,6 +62,10 @@ typedef struct dtsa_station_settings {
                          by itself */
     dtsa_link link;
 } dtsa_station_settings;
+
+/* How regularly agents send: lease, in anchors; policies with turns; those that draw lots, and in which
+ * agents that have arrived may be silent for ever. */
+enum { DTSA_SENDS_IN_ANCHORS, DTSA_SENDS_IN_TURNS, DTSA_SENDS_BY_CHANCE };
 
 /* What it does at first: it listens; slot 0 of all starts at origin_ns, and it flies from there; it
  * listens, and if it hears no frame slot 0 has started at origin_ns. */

@@ -69,8 +69,10 @@ static void set_times(dtsa_station *s)
     const int64_t slot = c->slot_ns, anchors = (int64_t)c->anchor_every * c->agents * slot,
                   mains = (int64_t)c->main_every * c->agents * slot;
     s->round_ns = anchors;
-    s->moving_ns = c->moving_slots ? c->moving_slots * slot : larger(2 * anchors, HALF_SECOND);
-    s->resting_ns = c->resting_slots ? c->resting_slots * slot : larger(6 * mains, HALF_SECOND);
+    s->moving_ns = larger((c->sends == DTSA_SENDS_BY_CHANCE ? 18 : 2) * anchors, HALF_SECOND);
+    s->resting_ns = c->sends == DTSA_SENDS_IN_ANCHORS ? larger(6 * mains, HALF_SECOND)
+                    : c->sends == DTSA_SENDS_IN_TURNS ? s->moving_ns
+                                                      : INT64_MAX;
     s->patience_ns = larger(2 * mains, HALF_SECOND);
     s->lead_ns = share(slot, LEAD);
     s->latest_lead_ns = c->equal_tables ? -smaller(share(slot, LONGEST_WAIT), LONGEST_WAIT_NS)

@@ -98,7 +98,7 @@ class MissionLog:
 
     def write(self, directory: Path, reason: str) -> None:
         """Write `mission.json` in the flight's directory; `reason`: why the mission was cut short, or ""."""
-        logs = sorted(self.vehicles.items())
+        logs = sorted(self.vehicles.items(), key=lambda item: (len(item[0]), item[0]))  # cf9 before cf10
         content = {
             "began_unix_s": round(self.began, 3),
             "duration_s": round(time.time() - self.began, 3),

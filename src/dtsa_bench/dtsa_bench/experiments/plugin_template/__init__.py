@@ -25,8 +25,8 @@ def write_package(name: str, directory: Path) -> list[Path]:
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name) or len(name) > 40 or keyword.iskeyword(name):
         raise ConfigError("NAME", name, _ALLOWED)
     if name in POLICIES.rows or name in POLICIES.plug_ins():
-        taken = ", ".join((*POLICIES.rows, *sorted(POLICIES.plug_ins())))
-        raise ConfigError("NAME", name, f"another name: {taken} exist")
+        names = ", ".join((*POLICIES.rows, *sorted(POLICIES.plug_ins())))
+        raise ConfigError("NAME", name, f"another name: {names} exist")
     module = name.replace("-", "_")
     _check_free(name, module)
     words = {
@@ -49,10 +49,10 @@ def _check_free(name: str, module: str) -> None:
     """Raise ConfigError if the package would be in the way of another one."""
     if module in sys.stdlib_module_names:
         raise ConfigError("NAME", name, f"another name: {module} is a module of Python's own")
-    for taken in (module, f"dtsa_{module}"):
-        spec = find_spec(taken)
+    for package in (module, f"dtsa_{module}"):
+        spec = find_spec(package)
         if spec is not None and spec.origin is not None:  # a mere directory of that name has no origin
-            raise ConfigError("NAME", name, f"another name: a module {taken} is installed ({spec.origin})")
+            raise ConfigError("NAME", name, f"another name: a module {package} is installed ({spec.origin})")
     try:
         distribution(f"dtsa-{name}")
     except PackageNotFoundError:

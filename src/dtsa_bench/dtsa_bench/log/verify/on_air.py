@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.agents.delays import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
 

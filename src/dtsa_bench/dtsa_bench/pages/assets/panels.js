@@ -15,7 +15,7 @@ function sending(run, time) {
 /* [label, value(run, row, time) -> [value, extra, class]] */
 const FIGURES = [
   ["Sends", (run, row, time) => sending(run, time)],
-  ["Channel load, last second", (run, row, time) => {
+  ["Slots with a frame, last second", (run, row, time) => {
     const load = run.load(time, 1);
     return load ? [percent(load.success, 0), `collided ${percent(load.collision, 0)}, idle ${percent(load.idle, 0)}`, load.collision > 0.02 ? "bad" : ""] : ["–", ""];
   }],

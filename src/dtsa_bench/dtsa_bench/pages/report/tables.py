@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from dtsa_bench.drawing.style import save, themed
 from dtsa_bench.experiments.charts import draw, league_scores
-from dtsa_bench.experiments.league import HEADS, LeagueTable
+from dtsa_bench.experiments.league import HEADS, STAR, LeagueTable
 from dtsa_bench.experiments.statistics import LEVEL, wilson
 from dtsa_bench.experiments.tables import CRASHED, SweepTable, label_of
 from dtsa_bench.pages.html import render_page, write_page
@@ -76,11 +76,11 @@ def write_report(table: SweepTable, directory: Path, code: str, command: str = "
 
 
 def _groups(table: SweepTable) -> Part:
-    measures = table.known()
-    ends = [name for name in ("timed_out", "failed") if any(getattr(group, name) for group in table.flown)]
+    measures = table.measured()
+    ends = [name for name in ("timed_out", "failed") if any(getattr(group, name) for group in table.groups_with_runs)]
     heads = [*table.sweep.axes, "crashed", *(name.replace("_", " ") for name in ends), *map(label_of, measures)]
     rows = []
-    for group in table.flown:
+    for group in table.groups_with_runs:
         mark = Markup('<span class="bad">{}</span>' if group.crashed.count else '<span class="good">{}</span>')
         rows.append([
             *(str(group.labels[axis]) for axis in table.sweep.axes),
@@ -138,4 +138,5 @@ _LEAGUE_NOTES = (
     "flight, ten rounds of TDMA. So schemes that lose their hardest flights gain nothing by it.",
     "Rank: by lost flights times age. Whether the flights are right, “league check” says.",
     "A bound looks into all agents. Nobody can fly it.",
+    STAR,
 )

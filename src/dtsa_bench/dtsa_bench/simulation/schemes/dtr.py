@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.plugins.kinds import PacketRadio
-from dtsa_agent.core.plugins.table import Table
+from dtsa_agent.core.plugins.kinds import PacketRadio, Table
 
 _MOST_AGENTS = 20  # MAX_NETWORK_SIZE
 _HEADER = 5  # bytes: size of the packet, kind, source, target, size of the data

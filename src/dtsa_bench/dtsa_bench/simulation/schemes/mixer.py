@@ -6,8 +6,7 @@ import numpy as np
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.plugins.kinds import PacketRadio
-from dtsa_agent.core.plugins.table import Table
+from dtsa_agent.core.plugins.kinds import PacketRadio, Table
 from dtsa_channel_sim.model.airtime import Airtime
 
 #: us between packets that are no airtime; an assumption.

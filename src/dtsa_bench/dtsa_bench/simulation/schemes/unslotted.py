@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.plugins.kinds import Radio
-from dtsa_agent.core.plugins.table import Table
+from dtsa_agent.core.plugins.kinds import Radio, Table
 from dtsa_channel_sim.model.airtime import Airtime
 
 from .knowledge import has_arrived

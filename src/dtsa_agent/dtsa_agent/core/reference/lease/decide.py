@@ -41,7 +41,7 @@ def decide(memory: Memory, self_index: int, slot: int, far_from_goal: bool) -> C
 
 
 def watch_goal(memory: Memory, slot: int, far_from_goal: bool) -> None:
-    """Notes since when the agent is idle, or that it wakes."""
+    """Note since when the agent is idle, or that it wakes."""
     if not far_from_goal:
         if memory.idle_since == NEVER:
             memory.idle_since = slot

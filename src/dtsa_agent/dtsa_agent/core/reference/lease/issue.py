@@ -16,7 +16,7 @@ MORE = 2  # a mover hands on turns that are worth so many times as much to anoth
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class TurnAnnouncement:
     """What a frame says about turns."""
 
     c_s: int = 0
@@ -47,7 +47,9 @@ class Electorate:
         return sum(self.able)
 
 
-def say(memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leaves: bool) -> Said:
+def announce_turns(
+    memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leaves: bool
+) -> TurnAnnouncement:
     """What the agent's frame says about turns; the turns that it gives away are noted.
 
     :param velocity: of the agent, m/s.
@@ -64,7 +66,9 @@ def say(memory: Memory, self_index: int, table: Table, slot: int, velocity: Vect
     near = [turn for turn in handed if turn - slot <= RELAY_REACH]
     far = tuple(turn - slot for turn in handed if turn - slot > RELAY_REACH)
     lessee = memory.leases[handed[-1]].lessee if far else 0
-    return Said(c_s, leaving, leases, relay(memory, self_index, slot, near, own_is_said=bool(leases)), far, lessee)
+    return TurnAnnouncement(
+        c_s, leaving, leases, relay(memory, self_index, slot, near, own_is_said=bool(leases)), far, lessee
+    )
 
 
 def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
@@ -79,7 +83,7 @@ def electorate(memory: Memory, self_index: int, table: Table, slot: int, velocit
     """Who may be given a turn, and who else there is."""
     rows, agents = table.rows, range(memory.rules.agents)
     presumed = [is_presumed(memory, table, k, slot) for k in agents]
-    alive = [k == self_index or presumed[k] or memory.alive(k) for k in agents]
+    alive = [k == self_index or presumed[k] or memory.is_connected(k) for k in agents]
     moves = [sets_out(memory, table, k) if presumed[k] else rows[k].in_ap for k in agents]
     able = [alive[k] and moves[k] and not memory.quiet[k] and memory.missed[k] < MISSED for k in agents]
     able[self_index] = memory.moving
@@ -140,32 +144,32 @@ def open_block(agents: int, every: int, resting: int, settled: int) -> int:
     return block
 
 
-def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
+def depth(memory: Memory, voters: Electorate, slot: int, final: bool) -> int:
     """How many of its next turns an agent that rests gives away: all if it is final, else floor(c x idle rounds)."""
     rules = memory.rules
-    if memory.idle_since < 0 or not who.members or memory.deaf:
+    if memory.idle_since < 0 or not voters.members or memory.deaf:
         return 0
-    if who.members > rules.lease_share * who.alive:
+    if voters.members > rules.lease_share * voters.alive:
         return 0
     if final:
-        return rules.main_every if who.informed else 1
+        return rules.main_every if voters.informed else 1
     turns = rules.depth_rate * (slot - memory.idle_since) / rules.agents
     return int(min(turns, rules.anchor_every))
 
 
-def is_open(memory: Memory, who: Electorate, turn: int) -> bool:
+def is_open(memory: Memory, voters: Electorate, turn: int) -> bool:
     """Whether a turn goes to those who wake: the first one in its block that its owner gives away."""
-    if not who.block:
+    if not voters.block:
         return False
-    first = max(turn - turn % who.block, turn - 2 * memory.rules.agents)
-    return not any(is_spare(memory, who, t) for t in range(first, turn))
+    first = max(turn - turn % voters.block, turn - 2 * memory.rules.agents)
+    return not any(is_spare(memory, voters, t) for t in range(first, turn))
 
 
-def is_spare(memory: Memory, who: Electorate, turn: int) -> bool:
+def is_spare(memory: Memory, voters: Electorate, turn: int) -> bool:
     """Whether a turn is one that its owner gives away, as far as is known."""
     owner = memory.owner(turn)
-    kept = memory.is_main(turn) if who.settled[owner] else memory.is_anchor(turn)
-    return who.rests[owner] and turn >= memory.rules.agents and not kept
+    kept = memory.is_main(turn) if voters.settled[owner] else memory.is_anchor(turn)
+    return voters.rests[owner] and turn >= memory.rules.agents and not kept
 
 
 def issue(
@@ -184,11 +188,11 @@ def issue(
     :param own_depth: how many own turns at most; None: as :func:`depth` says.
     :returns: a byte a turn, up to the last that is given away.
     """
-    who = electorate(memory, self_index, table, slot, velocity, final)
+    voters = electorate(memory, self_index, table, slot, velocity, final)
     foreseen = slot + 1  # up to here, excluded
-    rounds_mine = depth(memory, who, slot, final) if own_depth is None else own_depth
+    rounds_mine = depth(memory, voters, slot, final) if own_depth is None else own_depth
     rounds_adopted = memory.rules.anchor_every if memory.idle_since >= 0 else 1
-    said = []
+    lessees = []
     for turn in memory.turns_of_leases(slot, c_s, LEASE_ROOM):
         mine = memory.owner(turn) == self_index
         rounds_ahead = -(-(turn - slot) // memory.rules.agents)  # rounded up
@@ -197,21 +201,21 @@ def issue(
         reach = rounds_mine if mine else rounds_adopted
         if turn not in memory.leases and rounds_ahead <= reach and not memory.probation:
             lessee = 0
-            if mine and is_open(memory, who, turn):
+            if mine and is_open(memory, voters, turn):
                 lessee = OPEN
-            elif who.members and (mine or not memory.deaf):
+            elif voters.members and (mine or not memory.deaf):
                 if foreseen == slot + 1:
-                    who.rights = look_ahead(memory, who, slot)
-                foresee(memory, who, range(foreseen, turn))
+                    voters.rights = turns_ahead(memory, voters, slot)
+                foresee(memory, voters, range(foreseen, turn))
                 foreseen = turn
-                lessee = choose_lessee(memory, who, turn) + 1
+                lessee = choose_lessee(memory, voters, turn) + 1
             if lessee:
                 memory.leases[turn] = Lease(lessee, self_index + 1)
-        said.append(memory.leases[turn].lessee if turn in memory.leases else 0)
-    return bytes(said).rstrip(b"\0")
+        lessees.append(memory.leases[turn].lessee if turn in memory.leases else 0)
+    return bytes(lessees).rstrip(b"\0")
 
 
-def look_ahead(memory: Memory, who: Electorate, slot: int) -> list[list[int]]:
+def turns_ahead(memory: Memory, voters: Electorate, slot: int) -> list[list[int]]:
     """For each agent the slots to come in which it is known to send."""
     rights: list[list[int]] = [[] for _ in range(memory.rules.agents)]
     for turn in range(slot + 1, slot + memory.window):
@@ -221,15 +225,15 @@ def look_ahead(memory: Memory, who: Electorate, slot: int) -> list[list[int]]:
     return rights
 
 
-def foresee(memory: Memory, who: Electorate, turns: range) -> None:
+def foresee(memory: Memory, voters: Electorate, turns: range) -> None:
     """Who will send in the turns to come, as far as is known."""
     for turn in turns:
         sender = memory.scheduled(turn)
         if sender >= 0:
-            who.last[sender] = turn
+            voters.last[sender] = turn
 
 
-def worth(memory: Memory, who: Electorate, k: int, turn: int) -> int:
+def worth(memory: Memory, voters: Electorate, k: int, turn: int) -> int:
     """What a turn is worth to an agent: p min(n, m), times its need.
 
     p and n are the distances from the turn to the agent's previous and next slot, as far as they are known or foreseen;
@@ -237,24 +241,24 @@ def worth(memory: Memory, who: Electorate, k: int, turn: int) -> int:
     will come in between.
     """
     longest = memory.rules.agents + 1
-    before = min(turn - who.last[k], longest)
-    after = next((right - turn for right in who.rights[k] if right > turn), longest)
-    return before * min(after, who.members) * who.need[k]
+    before = min(turn - voters.last[k], longest)
+    after = next((right - turn for right in voters.rights[k] if right > turn), longest)
+    return before * min(after, voters.members) * voters.need[k]
 
 
-def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> int:
+def choose_lessee(memory: Memory, voters: Electorate, turn: int, but: int = -1) -> int:
     """To whom a turn is worth most, the lowest id of several; -1: nobody is able.
 
     :param but: index of an agent that is not asked.
     """
-    able = [k for k in range(memory.rules.agents) if who.able[k] and k != but]
-    return max(able, key=lambda k: worth(memory, who, k, turn), default=-1)  # the first of several
+    able = [k for k in range(memory.rules.agents) if voters.able[k] and k != but]
+    return max(able, key=lambda k: worth(memory, voters, k, turn), default=-1)  # the first of several
 
 
 def hand_on(
     memory: Memory, self_index: int, table: Table, slot: int, velocity: Vector, final: bool, leases: bytes
 ) -> list[int]:
-    """Hands on turns that the agent was given; not the next slot's: frames may arrive late.
+    """Hand on turns that the agent was given; not the next slot's: frames may arrive late.
 
     If it rests, all within reach that come before its last turn there, in which it can hand on further ones; beyond the
     relay's reach all to one agent, to whom the first of them is worth most. If it moves, those within the relay's reach
@@ -269,26 +273,26 @@ def hand_on(
         return handed
     reach = FAR_REACH if idle and len(leases) <= SECTION_BYTES else RELAY_REACH
     mine = [t for t in range(slot + 2, slot + min(reach, memory.window - 1) + 1) if memory.scheduled(t) == self_index]
-    given = [t for t in (mine[:-1] if idle else mine) if t in memory.leases]
-    if not given:
+    leased = [t for t in (mine[:-1] if idle else mine) if t in memory.leases]
+    if not leased:
         return handed
-    who = electorate(memory, self_index, table, slot, velocity, final)
-    who.rights = look_ahead(memory, who, slot)
-    who.last[self_index] = slot
+    voters = electorate(memory, self_index, table, slot, velocity, final)
+    voters.rights = turns_ahead(memory, voters, slot)
+    voters.last[self_index] = slot
     foreseen = slot + 1  # up to here, excluded
     heir = -1  # to whom all turns beyond the relay's reach go
-    for turn in given:
+    for turn in leased:
         far = turn - slot > RELAY_REACH
         if not far and len(handed) == RELAY_IDS:
             continue
         k = heir
         if not far or heir < 0:
-            foresee(memory, who, range(foreseen, turn))
+            foresee(memory, voters, range(foreseen, turn))
             foreseen = turn
-            k = choose_lessee(memory, who, turn, but=self_index)
+            k = choose_lessee(memory, voters, turn, but=self_index)
         if k < 0 or k == memory.owner(turn):
             continue
-        if idle or worth(memory, who, k, turn) >= MORE * worth(memory, who, self_index, turn):
+        if idle or worth(memory, voters, k, turn) >= MORE * worth(memory, voters, self_index, turn):
             memory.leases[turn] = Lease(k + 1, HANDED)
             handed.append(turn)
             heir = k if far else -1
@@ -305,7 +309,7 @@ def relay(
     """
     turns = list(handed)
     for turn in range(slot + 1, slot + min(RELAY_REACH, memory.window - 1) + 1):
-        said = own_is_said and memory.owner(turn) == self_index
-        if turn in memory.leases and turn not in handed and not said and len(turns) < RELAY_IDS:
+        is_named = own_is_said and memory.owner(turn) == self_index
+        if turn in memory.leases and turn not in handed and not is_named and len(turns) < RELAY_IDS:
             turns.append(turn)
     return tuple((turn - slot, memory.leases[turn].lessee) for turn in sorted(turns))

@@ -13,7 +13,7 @@ from .memory import DEAF, GONE, MISSED, NEVER, Memory
 
 
 def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: ExtendedFrame, wakes: bool) -> None:
-    """Takes in a frame of somebody else."""
+    """Receive a frame of another agent."""
     if not memory.started:
         return
     sender = frame.own.sender - 1
@@ -24,15 +24,15 @@ def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: Exte
     memory.missed[sender] = 0
     memory.quiet[sender] = frame.probation
     memory.heard[sender] = GONE if frame.leaving else slot
-    judge_claim(memory, self_index, slot, frame, was_absent)
+    check_claim(memory, self_index, slot, frame, was_absent)
     memory.resting[sender] = frame.own.c_r == 0
     for entry in frame.gossip:
         hear_gossip(memory, self_index, table, slot - entry.age, entry)
     turns = memory.turns_of_leases(slot, frame.c_s, len(frame.leases))
-    given = [(turn, lessee) for turn, lessee in zip(turns, frame.leases, strict=False) if lessee]
+    leased = [(turn, lessee) for turn, lessee in zip(turns, frame.leases, strict=False) if lessee]
     if memory.owner(slot) == sender:
-        memory.settled[sender] = any(memory.owner(turn) == sender and memory.is_anchor(turn) for turn, _ in given)
-    for turn, lessee in given:
+        memory.settled[sender] = any(memory.owner(turn) == sender and memory.is_anchor(turn) for turn, _ in leased)
+    for turn, lessee in leased:
         memory.note(self_index, slot, sender + 1, turn, lessee, sender + 1)
     for ahead, lessee in frame.relay:
         memory.note(self_index, slot, sender + 1, slot + ahead, lessee, 0)
@@ -40,7 +40,7 @@ def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: Exte
         memory.note(self_index, slot, sender + 1, slot + ahead, frame.far_lessee, 0)
 
 
-def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, was_absent: bool) -> None:
+def check_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, was_absent: bool) -> None:
     """Probation begins where another agent may take this one for dead, and ends where that agent has heard it."""
     distance = (frame.own.sender - 1 - self_index) % memory.rules.agents
     if not memory.rules.adoption or frame.leaving:

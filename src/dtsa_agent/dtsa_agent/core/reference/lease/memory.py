@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dtsa_agent.core.reference.frame_extended import OPEN
-from dtsa_agent.core.reference.rules import Rules
+from dtsa_agent.core.reference.table import Rules
 
 DEAF = 4  # more silent slots in a row than this, and an agent is presumed deaf
 MISSED = 4  # who missed so many expected turns gets no leases
@@ -85,7 +85,7 @@ class Memory:
         n = self.rules.agents
         return (slot // n + slot % n) % self.rules.main_every == 0
 
-    def alive(self, k: int) -> bool:
+    def is_connected(self, k: int) -> bool:
         """Whether an agent was heard of lately."""
         return self.heard[k] >= 0 and self.now - self.heard[k] <= self.patience(k)
 
@@ -105,7 +105,7 @@ class Memory:
         return owner
 
     def note(self, self_index: int, slot: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
-        """Takes note of what a frame says of a turn.
+        """Note what a frame says of a turn.
 
         The lessee may hand the turn on, in a frame of its own; what is relayed later changes nothing. So a turn can
         come back to the agent itself, but not by an older frame than its own last one, which may not know what that
@@ -117,17 +117,17 @@ class Memory:
         """
         if not self.now < turn < self.now + self.window or self.is_main(turn):
             return
-        known, mine = self.leases.get(turn), lessee == self_index + 1
-        if known is None:
+        entry, mine = self.leases.get(turn), lessee == self_index + 1
+        if entry is None:
             self.leases[turn] = Lease(lessee, issuer)
-        elif lessee == known.lessee:
-            known.issuer = known.issuer or issuer
-        elif sender == known.lessee:
+        elif lessee == entry.lessee:
+            entry.issuer = entry.issuer or issuer
+        elif sender == entry.lessee:
             if not mine:
-                known.lessee = lessee
+                entry.lessee = lessee
             elif slot > self.spoke:
                 self.leases[turn] = Lease(lessee, 0)
-        elif known.issuer not in (0, issuer, self_index + 1, HANDED) and issuer and lessee < known.lessee:
+        elif entry.issuer not in (0, issuer, self_index + 1, HANDED) and issuer and lessee < entry.lessee:
             self.leases[turn] = Lease(lessee, issuer)
 
     def turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:

@@ -3,19 +3,67 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dtsa_agent.core.errors import DtsaError
+import dtsa_agent
+from dtsa_agent.core.errors import ConfigError, DtsaError
 
-from .library import HERE, LIBRARY, NotHere, compile_program, sources, tool
+HERE = Path(__file__).resolve().parent
+LIBRARY = Path(dtsa_agent.__file__).resolve().parent / "libdtsa"
+# Bits do not depend on compiler and machine.
+SAME_BITS = ("-std=c11", "-fno-fast-math", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
+
+
+class NotHere(DtsaError):
+    """A tool that is not on this machine; the message says which, and how to get it."""
+
+
+def tool(name: str, package: str) -> str:
+    """The path of a program; ``package`` is the Debian package that has it."""
+    path = shutil.which(name)
+    if path is None:
+        raise NotHere(f"missing: {name}; on Debian and Ubuntu: sudo apt install {package}")
+    return path
+
+
+def sources(library: Path = LIBRARY, without: Sequence[str] = ()) -> list[Path]:
+    """The C files of libdtsa."""
+    files = [path for path in sorted(library.rglob("*.c")) if path.name not in without]
+    if not files:
+        raise ConfigError("libdtsa", str(library), "a folder with its sources")
+    return files
+
+
+def compile_program(
+    compiler: str,
+    out: Path,
+    files: Sequence[Path],
+    flags: Sequence[str],
+    library: Path = LIBRARY,
+    links: Sequence[str] = ("-lm",),
+) -> Path:
+    """Compile and link files, those of libdtsa among them, with its headers in reach; the program.
+
+    :param flags: besides those that keep the bits the same.
+    :param links: options of the linker, at the end.
+    """
+    include = [f"-I{library / 'include'}", f"-I{library}"]
+    command = [compiler, *SAME_BITS, *flags, *include, *map(str, files), "-o", str(out), *links]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    if done.returncode:
+        raise DtsaError(f"{Path(compiler).name}: {done.stderr.strip()[-2000:]}")
+    return out
+
 
 TARGETS = {"frames": 64, "agents": 1024, "station": 1024}  # largest input, bytes
 _FLAGS = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all")
 
 
-class Found(DtsaError):
+class FuzzFinding(DtsaError):
     """An input on which libdtsa does what it must not; the message says which."""
 
 
@@ -58,7 +106,7 @@ def fuzz(program: Path, seconds: float, corpus: Path, seed: int = 0, most: int =
     command = [str(program), str(corpus), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds + 120, errors="replace")
     if done.returncode:
-        raise Found(f"{target}: {_essence(done.stderr)}")
+        raise FuzzFinding(f"{target}: {_essence(done.stderr)}")
     status = re.findall(r"cov: (\d+) ft: (\d+)", done.stderr)
     runs = re.search(r"number_of_executed_units: (\d+)", done.stderr)
     covered, features = status[-1] if status else (0, 0)

@@ -36,7 +36,7 @@ class AgentGroup:
         self.slot = -1  # the present slot, -1: none
 
     def on_slot(self, slot: int) -> tuple[int, ...]:
-        """Decides for a slot that begins now; the slot before is closed.
+        """Decide for a slot that begins now; the slot before is closed.
 
         :returns: positions in ``swarm.ids`` of those that send; their frames are ``swarm.frame(position)``.
         """
@@ -46,7 +46,7 @@ class AgentGroup:
         return swarm.begin(slot)
 
     def on_frames(self, slot: int, senders: Sequence[int], frames: Sequence[bytes], heard: Bytes) -> Bytes | None:
-        """Takes in all that the air carried in a slot.
+        """Receive all that the air carried in a slot.
 
         :param slot: the slot in which it is heard.
         :param senders: ids of those that sent, as the air knows them.
@@ -118,7 +118,7 @@ class Agent:
         self.group = AgentGroup(self.swarm)
 
     def on_slot(self, slot: int) -> bytes | None:
-        """Decides for a slot that begins now.
+        """Decide for a slot that begins now.
 
         :param slot: its number; if the slot before is still open it is closed.
         :returns: the frame to send in it, or None.
@@ -128,7 +128,7 @@ class Agent:
         return self.swarm.frame(0) if self.group.on_slot(slot) else None
 
     def on_frame(self, data: bytes, slot: int) -> bool:
-        """Takes in the bytes of a frame.
+        """Receive the bytes of a frame.
 
         :param data: what was heard; malformed bytes are counted in ``swarm.malformed`` and ignored.
         :param slot: the slot it was heard in.

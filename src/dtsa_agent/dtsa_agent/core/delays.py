@@ -9,18 +9,18 @@ _BOUNDS = 1_000.0 * 1.05 ** np.arange(380)  # ns, 1 us to 107 s: a quantile is r
 
 
 class Delays:
-    """Counts delays by size, for one or several series; a series of None in a question: all of them."""
+    """Count delays by size, for one or several series; a series of None in a question: all of them."""
 
     def __init__(self, series: int = 1) -> None:
         self._counts = np.zeros((series, len(_BOUNDS) + 1), dtype=np.int64)
         self._largest = np.zeros(series)
 
     def add(self, delay_ns: float, series: int = 0) -> None:
-        """Takes in one delay, ns; what is below 0 counts as 0."""
+        """Receive one delay, ns; what is below 0 counts as 0."""
         self.add_many(np.array([delay_ns]), np.array([series]))
 
     def add_many(self, delay_ns: NDArray[np.generic], series: NDArray[np.intp]) -> None:
-        """Takes in delays, (n,) ns, of several series, (n,) indices, all different."""
+        """Receive delays, (n,) ns, of several series, (n,) indices, all different."""
         self._counts[series, np.searchsorted(_BOUNDS, delay_ns)] += 1
         self._largest[series] = np.maximum(self._largest[series], delay_ns)
 

@@ -1,0 +1,203 @@
+"""`dtsa agent` and `dtsa sniff`: agents whose frames go over a network or a radio; the options that they share."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from dtsa_agent.air.port import AIRS, PortSettings, check_fits, settings_class
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.declaration import Setting, Settings, names_with_values, settings_of
+from dtsa_agent.core.station import check_joinable
+from dtsa_agent.keys import check_key, check_session
+from dtsa_agent.yaml_file import read_yaml
+from dtsa_bench.runs.options import add_options, given_options, number
+
+from .registry import Command, hint
+
+DEFAULT_POLICY = "lease"
+
+
+_NO_OPTION = ("policy", "auth", *(s.name for s in settings_of(SwarmConfig) if s.group == "Priority and selection"))
+
+
+_ROS = "/**", "ros__parameters"  # of a file of ROS parameters, which counts as well
+
+
+_OPTIONS = {"policy": "policy", "auth": "seal"}  # settings whose options are called otherwise
+
+
+def add_results(parser: argparse.ArgumentParser) -> None:
+    """Add what carries the frames, and where the results go."""
+    parser.add_argument("--air", choices=AIRS, help=f"what carries the frames [{AIRS[0]}]")
+    parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
+    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+
+
+def add_network_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ports and swarm, and their file. A setting that several ports have is one option."""
+    parser.add_argument(
+        "--swarm",
+        metavar="FILE",
+        dest="swarm_file",
+        help="YAML file of settings that all computers share, as `agents: 12`; options go before it",
+    )
+    names: set[str] = set()
+    for air in AIRS:
+        group = parser.add_argument_group(f"what carries the frames: --air {air}")
+        add_options(group, settings_class(air), "port", skip=names)
+        names |= {setting.name for setting in settings_of(settings_class(air))}
+    parser.add_argument_group("authentication").add_argument(
+        "--seal",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="frames carry a code that only holders of the key can make; the key is in the environment: DTSA_AUTH_KEY "
+        "[--seal]",
+    )
+    swarm = parser.add_argument_group("the swarm: what all agents share")
+    swarm.add_argument("--policy", metavar="NAME", help=f"who sends next [{DEFAULT_POLICY}]")
+    add_options(swarm, SwarmConfig, "swarm", skip=_NO_OPTION)
+
+
+def read_network_options(args: argparse.Namespace) -> tuple[PortSettings, SwarmConfig]:
+    """What carries the frames, and what all agents share, as options and file say; options go before the file.
+
+    :raises ConfigError: for a setting that does not exist or cannot be, or a missing key or session.
+    """
+    _read_file(args)
+    cls = settings_class(args.air)
+    specs = {setting.name: setting for setting in settings_of(cls)}
+    values = {dest.partition(".")[2]: value for dest, value in vars(args).items() if dest.startswith("port.")}
+    port = cls.from_dict({
+        name: specs[name].parse(value) if name in specs and isinstance(value, str) else value
+        for name, value in values.items() if value is not None
+    })  # fmt: skip
+    named = {"policy": args.policy or DEFAULT_POLICY, "auth": args.seal is not False}
+    config = SwarmConfig.from_dict({**given_options(args, SwarmConfig, "swarm"), **named})
+    check_key(config)  # before anything is made
+    check_session(config)
+    return port, config
+
+
+def _read_file(args: argparse.Namespace) -> None:
+    """Settings of the file stand for options that were not given; an error names both."""
+    path = args.swarm_file
+    values = {} if path is None else _content(path)
+    air = values.pop("air", AIRS[0])
+    args.air = args.air or Setting("air", "text", None, "what carries the frames", words=AIRS).check(
+        air, f"air in {path}"
+    )
+    sections: dict[str, type[Settings]] = {"swarm": SwarmConfig, "port": settings_class(args.air), "own": AgentSettings}
+    settings = {setting.name: (name, setting) for name, cls in sections.items() for setting in settings_of(cls)}
+    for name, value in values.items():
+        if name == "id":
+            raise ConfigError(f"id in {path}", value, "what all agents share; each has an --id of its own")
+        if name not in settings:
+            allowed = f"a setting of the swarm, of the port {args.air} or of the agent{hint(str(name), settings)}"
+            raise ConfigError(f"{name} in {path}", value, allowed)
+        section, setting = settings[name]
+        option = _OPTIONS.get(name, f"{section}.{name}")
+        checked = value if setting.custom else setting.check(value, f"{name} in {path}")
+        if getattr(args, option, None) is None:
+            setattr(args, option, checked)
+
+
+def _content(path: str) -> dict[str, Any]:
+    try:
+        content = read_yaml(path, "swarm")
+    except ConfigError as error:
+        if error.field == "swarm":
+            raise
+        raise ConfigError(f"{error.field} in {path}", error.value, error.allowed) from None
+    for section in _ROS:
+        if isinstance(content, Mapping) and section in content:
+            content = content[section]
+    return dict(names_with_values(content, f"swarm {path}"))
+
+
+class AgentCommand(Command):
+    description = """\
+Flies one agent, with a simulated vehicle, whose frames go over a port (--air): one process a computer, no channel
+node, no start signal, no ROS. The first agent begins; groups that meet become one. Frames are sealed: the key is in the
+environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
+    examples = (
+        ("--id 3 --interface eth0 --auth-session 41", "the third of twelve; the key is in DTSA_AUTH_KEY"),
+        ("--id 1 --agents 4 --interface lo --no-seal --duration-s 10 --out runs/cf1", "ten seconds, with a bag"),
+        ("--swarm swarm.yaml --id 3 --auth-session 40 --check", "before a flight: do all hear all"),
+        ("--id 3 --air crazyradio --uri radio://0/80/2M --slot-ms 20 --auth-session 41", "by a Crazyradio 2.0"),
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.usage = "%(prog)s --id N (--interface NAME | --device PATH | --uri URI) [OPTIONS]"
+        add_results(parser)
+        own = parser.add_argument_group("this agent")
+        add_options(own, AgentSettings, "own")
+        own.add_argument(
+            "--check",
+            nargs="?",
+            const="0",
+            metavar="SECONDS",
+            help="does not fly: tells who is heard, in time, and by whom; exit code 0: all hear all [until all know]",
+        )
+        add_network_options(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Fly until Ctrl-C, and print what came of it."""
+        from dtsa_bench.network.flying import AgentJob, check, fly
+
+        port, config = read_network_options(args)
+        own = AgentSettings.from_dict(given_options(args, AgentSettings, "own"))
+        check_joinable(config.policy)  # before anything is made
+        check_fits(config, port.properties)
+        job = AgentJob(own, config, port, args.out, args.json)
+        return fly(job) if args.check is None else check(job, number(args.check, "check", 0, 3600))
+
+
+class SniffCommand(Command):
+    description = """\
+Listens to a swarm on a network or a radio without taking part, records what it hears, and judges it: two senders in a
+slot, frames out of turn, turns given away twice or by others. Exit code 1 if a rule was broken. A listener may miss
+frames: then a lease that it does not know looks like a broken rule."""
+    examples = (
+        ("--interface eth0 --auth-session 41 --out runs/sniffed", "twelve agents; until Ctrl-C"),
+        ("--air crazyradio --uri radio://0/80/2M --slot-ms 20 --auth-session 41", "with a Crazyradio 2.0"),
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.usage = "%(prog)s (--interface NAME | --device PATH | --uri URI) [OPTIONS]"
+        add_results(parser)
+        parser.add_argument("--duration-s", metavar="X", default="0", help="for so long; 0: until Ctrl-C [0]")
+        add_network_options(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Listen until Ctrl-C, and print what came of it."""
+        from dtsa_agent.stop import Stop
+        from dtsa_bench.log.bag.errors import BagError
+        from dtsa_bench.network.sniffer import Sniffer
+        from dtsa_bench.runs.options import new_directory, number
+
+        from .recordings import summary_lines
+
+        port, config = read_network_options(args)
+        duration = number(args.duration_s, "duration_s", 0, 1e6)
+        directory = None if args.out is None else new_directory(args.out)
+        path = None if directory is None else directory / "sniffed.mcap"
+
+        def report(line: str) -> None:
+            print(f"dtsa: {line}", file=sys.stderr, flush=True)
+
+        with Stop() as stop, Sniffer(config, port, path, report) as sniffer:
+            sniffer.run(stop, duration)
+        summary = sniffer.summary()
+        text = json.dumps(summary, indent=2) + "\n"
+        if directory is not None:
+            (directory / "summary.json").write_text(text, encoding="utf-8")
+        print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
+        if sniffer.bag is not None and sniffer.bag.failure:
+            raise BagError(sniffer.bag.failure)
+        return 1 if summary["rules_broken"] else 0
