@@ -1,4 +1,7 @@
-"""An environment for learning: agents that say in each slot whether they send. See docs/how-to/learning.md."""
+"""Environments for learning: agents that say when they send, and any agents with a channel between them.
+
+See docs/how-to/learning.md and docs/how-to/environments.md.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,13 @@ from typing import Any
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.environment import MeanAge, Observer, Reward, SlotResults, SwarmEnv, fields
+from dtsa_bench.simulation.message_environment import MessageEnv, MessageMap
 
 from ._flights import run_config
 
-__all__ = ["MeanAge", "Observer", "Reward", "SlotResults", "SwarmEnv", "fields", "parallel_env"]
+__all__ = [
+    "MeanAge", "MessageEnv", "Observer", "Reward", "SlotResults", "SwarmEnv", "channel", "fields", "parallel_env",
+]  # fmt: skip
 
 
 def parallel_env(
@@ -37,3 +43,13 @@ def parallel_env(
         raise ConfigError("policy", settings["policy"], "none: the actions say who sends")
     run = run_config(**settings) if config is None else config
     return SwarmEnv(run, reward=reward, slots=slots, render_mode=render_mode)
+
+
+def channel(env: Any, messages: MessageMap | None = None, **more: Any) -> MessageEnv:
+    """Put a radio channel between the agents of any `ParallelEnv` of PettingZoo.
+
+    :param env: the environment.
+    :param messages: what belongs to other agents; this and all further arguments are those of :class:`MessageEnv`.
+    :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
+    """
+    return MessageEnv(env, messages, **more)
