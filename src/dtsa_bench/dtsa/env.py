@@ -1,4 +1,7 @@
-"""An environment for learning: agents that say in each slot whether they send. See docs/how-to/learning.md."""
+"""Environments for learning: agents that say when they send, and any agents with a channel between them.
+
+See docs/how-to/learning.md and docs/how-to/environments.md.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import TYPE_CHECKING
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.environment import MeanAge, Observer, Reward, SlotResults, SwarmEnv, fields
+from dtsa_bench.simulation.message_environment import MessageEnv, MessageMap
 
 from ._flights import config_of
 
@@ -15,7 +19,9 @@ if TYPE_CHECKING:
 
     from ._settings import RunSettings
 
-__all__ = ["MeanAge", "Observer", "Reward", "SlotResults", "SwarmEnv", "fields", "parallel_env"]
+__all__ = [
+    "MeanAge", "MessageEnv", "Observer", "Reward", "SlotResults", "SwarmEnv", "channel", "fields", "parallel_env",
+]  # fmt: skip
 
 
 def parallel_env(
@@ -44,3 +50,13 @@ def parallel_env(
     if "policy" in settings:
         raise ConfigError("policy", settings["policy"], "none: the actions say who sends")
     return SwarmEnv(config_of(config, settings), reward=reward, slots=slots, render_mode=render_mode)
+
+
+def channel(env: Any, messages: MessageMap | None = None, **more: Any) -> MessageEnv:
+    """Put a radio channel between the agents of any `ParallelEnv` of PettingZoo.
+
+    :param env: the environment.
+    :param messages: what belongs to other agents; this and all further arguments are those of :class:`MessageEnv`.
+    :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
+    """
+    return MessageEnv(env, messages, **more)

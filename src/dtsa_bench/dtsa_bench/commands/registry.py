@@ -29,6 +29,7 @@ COMMANDS = {
     "view": "a swarm in the browser: a recorded run, one that is being recorded, one on the ROS graph or a network",
     "report": "one web page about one or several recorded runs",
     "export": "a bag's contents as CSV or Parquet",
+    "relay": "topics of any robots over the shared channel: losses, delay, collisions, range",
     "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",
     "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
     "peer-lab": "copies of a Crazyflie app (C) on this machine: peer to peer, in virtual time",

@@ -120,6 +120,11 @@ class ChannelConfig(Settings):
         return self.partition if isinstance(self.partition, tuple) else ()
 
     @property
+    def needs_positions(self) -> bool:
+        """Whether it matters where agents are."""
+        return bool(self.range_m or self.capture_db)
+
+    @property
     def airtime(self) -> Airtime:
         """The radio's times."""
         return airtime_of(self.radio, self.bitrate, self.ramp_up_ns, self.link_delay_ns)

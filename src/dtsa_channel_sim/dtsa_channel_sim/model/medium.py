@@ -77,7 +77,7 @@ class Medium:
         self._groups = group_numbers(config.groups, config.agents) if config.groups else None
         #: Which receivers lose a frame to noise.
         self.losses = Losses(config, source or NoiseSource(config.seed, config.agents))
-        self.needs_positions = bool(config.range_m or config.capture_db)
+        self.needs_positions = config.needs_positions
         #: True when everybody hears and disturbs everybody: two frames at one time destroy each other
         #: everywhere.
         self.everywhere = not self.needs_positions and self._groups is None

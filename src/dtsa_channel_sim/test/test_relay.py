@@ -1,0 +1,250 @@
+"""The relay as a process, between nodes that know nothing of it."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from node_helpers import Graph, ros_graph
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+
+from dtsa_agent.ros.common.checks import BadMessage
+from dtsa_channel_sim.relay.node import TransformTree
+
+pytestmark = pytest.mark.ros
+MODULE = "dtsa_channel_sim.relay.node"
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Iterator[Graph]:
+    with ros_graph(tmp_path) as graph:
+        yield graph
+
+
+def relay(
+    graph: Graph, path: Path, channel: dict[str, Any], robots: dict[str, Any], *more: str
+) -> subprocess.Popen[str]:
+    path.write_text(yaml.safe_dump({"channel": channel, "robots": robots}), encoding="utf-8")
+    return graph.start(MODULE, "-p", f"config:={path}", *more, logs=True)
+
+
+class Pair:
+    """Robot 1 sends texts to robot 2; ``lists`` has what came out."""
+
+    def __init__(self, graph: Graph, qos: QoSProfile | int = LATCHED, kind: Any = String) -> None:
+        self.graph, self.texts, self.reports = graph, [], []  # type: ignore[var-annotated]
+        self.publisher = graph.node.create_publisher(kind, "/robot1/text", qos)
+        name = "/robot2/from/robot1/text"
+        self.subscription = graph.node.create_subscription(kind, name, self.texts.append, qos)
+        graph.node.create_subscription(DiagnosticArray, "/diagnostics", self.reports.append, 10)
+
+    def connect(self) -> None:
+        """Waits until messages would come through."""
+        self.graph.until(lambda: self.publisher.get_subscription_count() and self.connected())
+
+    def connected(self) -> bool:
+        return bool(self.graph.node.get_publishers_info_by_topic("/robot2/from/robot1/text"))
+
+    def counts(self) -> dict[str, str]:
+        """The last report on the pair."""
+        for status in self.reports[-1].status if self.reports else ():
+            if status.name == "relay: robot1 to robot2":
+                return {value.key: value.value for value in status.values}
+        return {}
+
+    def send(self, first: int, end: int, every_s: float = 0.0) -> None:
+        for number in range(first, end):
+            self.publisher.publish(String(data=str(number)))
+            self.graph.executor.spin_once(timeout_sec=every_s)
+
+    def until_sent(self, count: int) -> None:
+        self.graph.until(lambda: self.counts().get("sent") == str(count))
+
+
+TWO: dict[str, Any] = {"robot1": {"topics": {"text": {"bytes": 20}}}, "robot2": {}}
+
+
+@pytest.mark.parametrize("access", ["unlimited", "lease"])
+def test_losses_are_those_of_the_seed_however_messages_come(graph: Graph, tmp_path: Path, access: str) -> None:
+    """A hundred messages in one go and slowly: the same ones arrive. The queue holds them all."""
+    lost = []
+    for index, every_s in enumerate((0.0, 0.01)):
+        pair = Pair(graph, qos=100)
+        process = relay(
+            graph,
+            tmp_path / f"{index}.yaml",
+            {"loss": 0.3, "seed": 4, "access": access, "queue": 100, "slot_ms": 2},
+            TWO,
+        )
+        pair.connect()
+        pair.send(0, 100, every_s)
+        pair.until_sent(100)
+        graph.until(lambda pair=pair: sum(int(pair.counts()[k]) for k in ("received", "lost", "collided")) == 100)
+        counts = pair.counts()
+        assert int(counts["dropped"]) == int(counts["out_of_range"]) == int(counts["collided"]) == 0
+        graph.until(lambda pair=pair, counts=counts: len(pair.texts) == int(counts["received"]))
+        assert 10 < int(counts["lost"]) < 50
+        assert float(counts["delay_mean_ms"]) > 0.4
+        lost.append({int(text.data) for text in pair.texts})
+        began = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        assert time.monotonic() - began < 10
+        graph.node.destroy_publisher(pair.publisher)
+        graph.node.destroy_subscription(pair.subscription)
+        graph.until(lambda pair=pair: not pair.connected())
+    assert lost[0] == lost[1]
+
+
+def test_quality_of_service_is_the_publishers_and_a_latched_message_reaches_all(graph: Graph, tmp_path: Path) -> None:
+    pair = Pair(graph)
+    pair.send(0, 1)
+    relay(graph, tmp_path / "relay.yaml", {}, TWO)
+    graph.until(lambda: pair.texts)
+    late: list[String] = []
+    graph.node.create_subscription(String, "/robot2/from/robot1/text", late.append, LATCHED)
+    graph.until(lambda: late)
+    sensor = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = graph.node.create_publisher(String, "/robot1/sensor", sensor)
+    topics = {"robot1": {"topics": {"sensor": {}}}, "robot2": {}}
+    relay(graph, tmp_path / "sensor.yaml", {}, topics, "-r", "__node:=relay2")
+    got: list[String] = []
+    graph.node.create_subscription(String, "/robot2/from/robot1/sensor", got.append, sensor)
+    graph.until(lambda: got, lambda: publisher.publish(String(data="x")))
+    (info,) = graph.node.get_publishers_info_by_topic("/robot2/from/robot1/sensor")
+    assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+def test_odometry_says_who_is_in_range(graph: Graph, tmp_path: Path) -> None:
+    """Until it is known where a robot is, and beyond the range, nothing reaches it; odometry may be nonsense."""
+    robots = {"robot1": {**TWO["robot1"], "place": [0, 0, 0]}, "robot2": {"odometry": "odom"}}
+    pair = Pair(graph)
+    relay(graph, tmp_path / "relay.yaml", {"range_m": 10}, robots)
+    odometry = graph.node.create_publisher(Odometry, "/robot2/odom", 10)
+    pair.connect()
+    pair.send(0, 5)
+    graph.until(lambda: pair.counts().get("out_of_range") == "5")
+    message = Odometry()
+
+    def told_at(x: float) -> None:
+        message.pose.pose.position.x = x
+        odometry.publish(message)
+
+    graph.until(lambda: pair.texts, lambda: (told_at(3.0), told_at(float("nan")), pair.send(5, 6)))  # type: ignore[func-returns-value]
+    told_at(30.0)
+    graph.until(lambda: int(pair.counts()["out_of_range"]) > 5, lambda: pair.send(6, 7))
+
+
+def transform(parent: str, child: str, x: float, yaw: float = 0.0) -> TransformStamped:
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = parent
+    message.transform.translation.x = x
+    message.transform.rotation.z, message.transform.rotation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    return message
+
+
+def test_places_by_transforms() -> None:
+    """A chain of frames with a quarter turn; one that is not connected, a loop, and numbers that are none."""
+    tree = TransformTree("map")
+    chain = [transform("/map", "odom", 10.0, math.pi / 2), transform("odom", "robot1/base_link", 2.0)]
+    tree.accept(SimpleNamespace(transforms=[*chain, transform("a", "b", 1.0), transform("b", "a", 1.0)]))
+    assert tree.place_of("robot1/base_link") == pytest.approx([10.0, 2.0, 0.0])
+    assert all(math.isnan(number) for frame in ("a", "nowhere") for number in tree.place_of(frame))
+    with pytest.raises(BadMessage):
+        tree.accept(SimpleNamespace(transforms=[transform("map", "odom", float("nan"))]))
+    assert tree.place_of("odom") == pytest.approx([10.0, 0.0, 0.0])
+
+
+def test_time_is_that_of_the_clock_topic(graph: Graph, tmp_path: Path) -> None:
+    """Slots of one simulated second: nothing goes before the clock does, whatever the wall says."""
+    clock = graph.node.create_publisher(Clock, "/clock", 10)
+    pair = Pair(graph)
+    relay(graph, tmp_path / "relay.yaml", {"access": "tdma", "slot_ms": 1000}, TWO, "-p", "use_sim_time:=true")
+    pair.connect()
+    now = 5_000.0
+
+    def tick(step_s: float = 0.05) -> None:
+        nonlocal now
+        now += step_s
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = int(now), int(now % 1 * 1e9)
+        clock.publish(message)
+
+    tick()
+    graph.until(lambda: clock.get_subscription_count() > 0)
+    for _ in range(10):
+        tick(0.0)
+        graph.executor.spin_once(timeout_sec=0.05)
+    pair.send(0, 1)
+    pair.until_sent(1)
+    assert not pair.texts
+    began = now
+    graph.until(lambda: pair.texts, tick)
+    assert now - began > 0.5
+
+
+def test_what_is_wrong_is_named_and_nothing_ends(graph: Graph, tmp_path: Path) -> None:
+    """Topics that nobody publishes, of another type, messages that are too long: a line each, and the rest goes on."""
+    topics = {"text": {}, "later": {}, "wrong": {"type": "std_msgs/msg/String"}}
+    process = relay(
+        graph, tmp_path / "relay.yaml", {"access": "tdma", "slot_ms": 1}, {"robot1": {"topics": topics}, "robot2": {}}
+    )
+    pair = Pair(graph)
+    wrong = graph.node.create_publisher(PoseStamped, "/robot1/wrong", 1)
+    pair.connect()
+    pair.publisher.publish(String(data="x" * 1000))
+    pair.send(0, 3)
+    graph.until(lambda: len(pair.texts) == 3)
+    graph.until(lambda: pair.counts().get("received") == "3")
+    graph.until(lambda: "/robot1/later" in pair.reports[-1].status[0].message)
+    assert pair.reports[-1].status[0].values[1].value == "/robot1/text"
+    later = graph.node.create_publisher(String, "/robot1/later", 1)
+    graph.until(lambda: "waits" not in pair.reports[-1].status[0].message)
+    assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    output = process.communicate(timeout=60)[1]
+    assert process.returncode == 0
+    for line in (
+        "waits for /robot1/later",
+        "/robot1/wrong: type: got 'geometry_msgs/msg/PoseStamped'",
+        "a slot has 1 ms",
+    ):
+        assert output.count(line) == 1, output
+    assert "Traceback" not in output
+    del wrong, later
+
+
+@pytest.mark.parametrize(
+    ("robots", "channel", "line"),
+    [
+        ({"robot1": {"topics": {"x": {"type": "no_msgs/msg/Nothing"}}}, "robot2": {}}, {}, "no_msgs/msg/Nothing"),
+        ({"robot1": {"topics": {"x": {}}}, "robot2": {}}, {"range_m": 5}, "robots.robot1.place"),
+        ({"robot1": {"topics": {"x": {"bytes": 100}}}, "robot2": {}}, {"access": "tdma", "slot_ms": 0.3}, "a slot has"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_one_line(
+    graph: Graph, tmp_path: Path, robots: dict[str, Any], channel: dict[str, Any], line: str
+) -> None:
+    process = relay(graph, tmp_path / "relay.yaml", channel, robots)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 2
+    assert line in error
+    assert len(error.strip().splitlines()) == 1
+    graph.processes.remove(process)
