@@ -5,7 +5,7 @@ See docs/how-to/learning.md and docs/how-to/environments.md.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.runs.config import RunConfig
