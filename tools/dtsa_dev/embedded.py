@@ -103,12 +103,12 @@ def _measure_library(directory: Path) -> tuple[list[str], list[list[str]], str]:
 
 def _measure_board(directory: Path) -> tuple[list[str], list[list[str]], str]:
     """What `dtsa embedded --board` shows: heads, rows, sizes."""
-    from dtsa_bench.crazyflies.simulated.radio import esb
+    from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, TURN_NS, on_air_ns
     from dtsa_channel_sim.model.airtime import airtime_of
 
-    air = airtime_of("crazyflie", esb.BITRATES["2M"], esb.TURN_NS, 0)
+    air = airtime_of("crazyflie", BITRATES["2M"], TURN_NS, 0)
     # An empty packet up; down an empty one with its signal strength, or in every second one a state of 26 bytes.
-    poll_ns = esb.on_air_ns(1, "2M") + (esb.on_air_ns(3, "2M") + esb.on_air_ns(30, "2M")) / 2
+    poll_ns = on_air_ns(1, "2M") + (on_air_ns(3, "2M") + on_air_ns(30, "2M")) / 2
     rows = []
     for cost in fly_app_on_cortex(directory):
         mean, most = (count * CYCLES / CLOCK_MHZ for count in cost.instructions["slot"])

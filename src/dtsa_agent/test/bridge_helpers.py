@@ -126,9 +126,9 @@ class Flight:
         """Arm, climb to the middle of the room, and begin to stream zero velocity."""
         names = list(self.bridge.vehicles)
         ready = [n for n in names if self.bridge.vehicles[n].state == State.READY]
-        self.bridge.each(ready, lambda v: v.arm(True))
+        self.bridge.order_each(ready, lambda v: v.arm(True))
         wait_for(lambda: all(self.bridge.vehicles[n].state == State.ARMED for n in ready))
-        assert self.bridge.each(ready, lambda v: v.takeoff(0.95, 2.0)) == (True, "")
+        assert self.bridge.order_each(ready, lambda v: v.takeoff(0.95, 2.0)) == (True, "")
         time.sleep(2.3)
         self.velocity = dict.fromkeys(ready, (0.0, 0.0, 0.0))
         threading.Thread(target=self.pilot, daemon=True).start()

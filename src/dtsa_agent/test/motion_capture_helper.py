@@ -16,7 +16,7 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 
 from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
-from dtsa_bench.crazyflies.simulated import cli, process, world
+from dtsa_bench.crazyflies.simulated import cli, motion, process
 from dtsa_bench.crazyflies.simulated.estimate import Estimate
 from dtsa_bench.crazyflies.simulated.fleet import Fleet
 from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
@@ -78,7 +78,7 @@ class HostEstimate(Estimate):
 
     def update(self, position: Triple, velocity: Triple, acceleration: Triple) -> None:
         x, y, z = (np.array(acceleration) + IMU_NOISE_MPS2 * self._noise.standard_normal(3)).tolist()
-        self.filter.predict(world.TICK_S, (x, y, z))
+        self.filter.predict(motion.TICK_S, (x, y, z))
         super().update(self.filter.position, self.filter.velocity, acceleration)
 
     def correct(self, place: Triple, deviation: float) -> None:
@@ -126,7 +126,7 @@ class TrackedFleet(Fleet):
 
 
 def main() -> int:
-    world.Estimate = HostEstimate  # type: ignore[misc]
+    motion.Estimate = HostEstimate  # type: ignore[misc]
     cli.Fleet = TrackedFleet  # type: ignore[misc]
     process.FAULTS["unseen"] = "motion capture does not see it"
     code = cli.main(sys.argv[1:])

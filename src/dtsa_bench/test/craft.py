@@ -10,7 +10,7 @@ import pytest
 from dtsa_bench.crazyflies.simulated import crtp
 from dtsa_bench.crazyflies.simulated.estimate import Estimate
 from dtsa_bench.crazyflies.simulated.firmware import OFF, Firmware
-from dtsa_bench.crazyflies.simulated.peer import Peer
+from dtsa_bench.crazyflies.simulated.peer import CrtpPeer
 
 
 class Craft:
@@ -22,7 +22,7 @@ class Craft:
             lambda name, **details: self.events.append((name, details)), tau=0.0, auto_arming=auto_arming
         )
         self.estimate = Estimate()
-        self.peer = Peer(self.firmware, self.estimate, 12)
+        self.peer = CrtpPeer(self.firmware, self.estimate, 12)
         self.t = 0.0
         self.mode = OFF
         self.command = (0.0, 0.0, 0.0)

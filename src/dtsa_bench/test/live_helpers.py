@@ -28,12 +28,12 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.crazyflie.onboard import key_of
 from dtsa_bench.crazyflies.peer_lab import App, Laboratory, LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.laboratory import ADDRESS, TICK_NS
-from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard
-from dtsa_bench.crazyflies.peer_lab.record import Observer, Packet
+from dtsa_bench.crazyflies.peer_lab.onboard import OnboardSwarm
+from dtsa_bench.crazyflies.peer_lab.record import Observer, PeerPacket
 from dtsa_bench.crazyflies.simulated import crtp
-from dtsa_bench.crazyflies.simulated.radio import esb
-from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
-from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
+from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
+from dtsa_bench.crazyflies.simulated.radio.air import BROADCAST, PEER_PORT
+from dtsa_bench.crazyflies.simulated.radio.side import RadioServer
 from dtsa_bench.crazyflies.simulated.radio.sniffer_mode import Tuned
 from dtsa_channel_sim.model.medium import OnAir
 
@@ -42,10 +42,10 @@ BEHIND_NS = 20_000_000  # caught up at once; what is more is lost
 APP_CHANNEL = 2  # of CRTP's platform port
 
 
-def station(settings: LabSettings, agent: int) -> Station:
+def station(settings: LabSettings, agent: int) -> RadioAddress:
     address = (ADDRESS + agent).to_bytes(5, "big")
     uri = f"radio://0/{settings.channel}/{settings.rate}/{address.hex().upper()}"
-    return Station(uri, settings.channel, settings.rate, address)
+    return RadioAddress(uri, settings.channel, settings.rate, address)
 
 
 class LiveLaboratory(Laboratory):
@@ -56,85 +56,85 @@ class LiveLaboratory(Laboratory):
     ) -> None:
         stations = tuple(station(settings, agent) for agent in range(1, settings.agents + 1))
         radio = RadioSettings(dongles=dongles, path=path, stations=stations, loss=settings.loss, seed=settings.seed)
-        self.side = RadioSide(radio, self._hear_ground, lambda index, up: self.is_on(index + 1), listen=False)
+        self.server = RadioServer(radio, self._hear_ground, lambda index, up: self.is_on(index + 1), listen=False)
         self._ticks = 0
         self._stopped = False
         super().__init__(app, settings, out, [*observers, self._answer_ground])
-        for agent, receiver in enumerate(self.side.receivers, 1):
-            receiver.taken = partial(self.polled, agent)
-        for dongle in self.side.dongles:
+        for agent, receiver in enumerate(self.server.receivers, 1):
+            receiver.on_packet = partial(self.receive_poll, agent)
+        for dongle in self.server.dongles:
             dongle.between = self._between
         self.agenda.at(TICK_NS, self._log)
 
     def _open_air(self, seed: int) -> None:
-        self.agenda, self.air, self._first = self.side.agenda, self.side.air, self.side.first
+        self.agenda, self.air, self._first = self.server.agenda, self.server.air, self.server.first
 
     def stop(self) -> None:
         """End :meth:`fly`; also from a signal's handler."""
         self._stopped = True
 
     def fly(self, seconds: float) -> None:
-        self.side.listen()  # not before: the app has been compiled
+        self.server.listen()  # not before: the app has been compiled
         selector = selectors.SelectSelector()  # waits to the microsecond; epoll to the millisecond
-        selector.register(self.side.listener, selectors.EVENT_READ, None)
+        selector.register(self.server.listener, selectors.EVENT_READ, None)
         try:
             while not self._stopped and self.time < seconds:
                 for key, _ in selector.select(WAIT_S):
-                    self.side.take(key.data, selector)
-                self.side.origin_ns += max(0, self.side.now_ns() - self.now_ns - BEHIND_NS)
-                self.run(min(seconds, self.side.now_ns() / 1e9))
+                    self.server.serve_host(key.data, selector)
+                self.server.origin_ns += max(0, self.server.now_ns() - self.now_ns - BEHIND_NS)
+                self.run(min(seconds, self.server.now_ns() / 1e9))
         finally:
             for key in list(selector.get_map().values()):
                 if key.data is not None:
-                    self.side.leave(key.data)
+                    self.server.leave(key.data)
             selector.close()
 
     def close(self) -> None:
         super().close()
-        self.side.close()
+        self.server.close()
 
     # -- between ground and apps ------------------------------------------------------------------------------------
     def _hear_ground(self, index: int, packet: bytes, t: float) -> None:
         reply = self.peers[index].receive(packet, t)
         if reply is not None:
-            self.side.receivers[index].push(reply)
-        self.show(index)
+            self.server.receivers[index].push(reply)
+        self.update_app(index)
 
-    def hear(self, packet: Packet, heard: set[int], frame: OnAir) -> None:
+    def deliver_packet(self, packet: PeerPacket, heard: set[int], frame: OnAir) -> None:
         if packet.sender:  # dongles in sniffer mode have it, too
-            payload = bytes((0xFF, esb.PEER_PORT | packet.raw[0])) + packet.data
+            payload = bytes((0xFF, PEER_PORT | packet.raw[0])) + packet.data
             tuned = self.settings.channel, self.settings.rate
-            self.side.dongles[0].overheard(heard, esb.BROADCAST, payload, *tuned, frame)
-        super().hear(packet, heard, frame)
+            self.server.dongles[0].overheard(heard, BROADCAST, payload, *tuned, frame)
+        super().deliver_packet(packet, heard, frame)
 
     def _between(self, packet: bytes, heard: set[int], tuned: Tuned, frame: OnAir) -> None:
         if (tuned.channel, tuned.rate) == (self.settings.channel, self.settings.rate):
-            self.hear(Packet(0, bytes((packet[1] & 0x0F,)) + packet[2:], 0), heard, frame)
+            self.deliver_packet(PeerPacket(0, bytes((packet[1] & 0x0F,)) + packet[2:], 0), heard, frame)
 
     def _answer_ground(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
         if kind == "app_channel":
-            self.side.receivers[agent - 1].push(crtp.pack(crtp.PLATFORM, APP_CHANNEL, content))
+            self.server.receivers[agent - 1].push(crtp.pack(crtp.PLATFORM, APP_CHANNEL, content))
         elif kind == "print":
             data = content.encode()
             for first in range(0, len(data), crtp.MAX_DATA):
-                self.side.receivers[agent - 1].push(crtp.pack(crtp.CONSOLE, 0, data[first : first + crtp.MAX_DATA]))
+                self.server.receivers[agent - 1].push(crtp.pack(crtp.CONSOLE, 0, data[first : first + crtp.MAX_DATA]))
 
     def _log(self) -> None:
         self._ticks += 1
         now = self._ticks * TICK_NS
         self.agenda.at(now + TICK_NS, self._log)
-        for index, (peer, receiver) in enumerate(zip(self.peers, self.side.receivers, strict=True)):
+        for index, (peer, receiver) in enumerate(zip(self.peers, self.server.receivers, strict=True)):
             if not peer.blocks or not self.is_on(index + 1):
                 continue
             if not receiver.connected(now / 1e9):  # nobody is there: the log ends
                 peer.blocks.clear()
-                receiver.silent()
+                receiver.clear()
                 continue
             for packet in peer.log_packets(self._ticks, now / 1e9):
                 receiver.push(packet)
 
 
-class LiveOnBoard(OnBoard):
+class LiveOnboardSwarm(OnboardSwarm):
     """The protocol on board, with dongles on its air; the ground is a program there."""
 
     def __init__(self, path: Path, dongles: int, swarm: SwarmConfig, out: Path) -> None:
@@ -150,7 +150,7 @@ def main() -> int:
     lab: Any
     if what.endswith(".json"):
         swarm = SwarmConfig.from_dict(json.loads(Path(what).read_text(encoding="utf-8")))
-        flight = LiveOnBoard(Path(place), 3, swarm, Path(out))
+        flight = LiveOnboardSwarm(Path(place), 3, swarm, Path(out))
         lab, finish = flight.lab, flight.finish
     else:
         lab = LiveLaboratory(Path(place), 3, read_app(what), LabSettings(agents=int(more[0])))

@@ -19,10 +19,10 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Setting, Settings, settings_of
 from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, VehicleParams
-from dtsa_agent.crazyflie.onboard import OnBoardSettings
+from dtsa_agent.crazyflie.onboard import OnboardSettings
 from dtsa_agent.crazyflie.positions import PositionSettings
 from dtsa_agent.crazyflie.safety import SafetySettings
-from dtsa_agent.crazyflie.settings import BatterySettings, RobotSettings, StationSettings
+from dtsa_agent.crazyflie.settings import BatterySettings, GroundStationSettings, RobotSettings
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 from dtsa_dev.records import EVIDENCE, read_record
@@ -239,9 +239,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "modems": _modems,
     "robots": partial(settings_table, RobotSettings, skip=("name", "id")),
     "battery": partial(settings_table, BatterySettings),
-    "station": partial(settings_table, StationSettings),
+    "station": partial(settings_table, GroundStationSettings),
     "positions": partial(settings_table, PositionSettings),
-    "on_board": partial(settings_table, OnBoardSettings),
+    "on_board": partial(settings_table, OnboardSettings),
     "safety": partial(settings_table, SafetySettings),
     "radios": _radios,
     "faults": _faults,

@@ -20,7 +20,7 @@ import pytest
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import sanitizer_environment
-from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
+from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnboardSwarm
 from dtsa_bench.log.agent_bag import read
 from dtsa_bench.log.merge.merge import Merge
 
@@ -44,8 +44,8 @@ FAULTS: dict[str, dict[str, float]] = {
 ITEMS = [(fault, part, 100.0 if fault == ALL else 300.0) for fault in FAULTS for part in (1, 2)]
 
 
-def _change_goals(flight: OnBoard, seconds: float) -> None:
-    """Agents fly between start and target; none is told where the others fly to."""
+def _change_goals(flight: OnboardSwarm, seconds: float) -> None:
+    """Agents fly between start and target; none knows where the others fly to."""
     places = (np.array(flight.scenario.start), np.array(flight.scenario.target))
     for turn in range(1, int((seconds - ENABLED_S) / CHANGE_S)):
         for agent in range(1, flight.swarm.agents + 1):
@@ -53,7 +53,7 @@ def _change_goals(flight: OnBoard, seconds: float) -> None:
             flight.lab.at(ENABLED_S + turn * CHANGE_S, lambda a=agent, g=goal: flight.send_goal(a, g))  # type: ignore[misc]
 
 
-def _schedule_fault(flight: OnBoard, fault: str, seconds: float, seed: int) -> None:
+def _schedule_fault(flight: OnboardSwarm, fault: str, seconds: float, seed: int) -> None:
     lab = flight.lab
     if fault == "a brown-out in flight":
         lab.at(seconds - LAST_S, lambda: lab.switch_off(VICTIM))
@@ -73,7 +73,7 @@ def fly(fault: str, seconds: float, seed: int, directory: Path, flags: Sequence[
     """One flight of virtual time with a fault; what the laboratory says of it."""
     settings = LabSettings(seed=seed, drift_ppm=50.0, **FAULTS[fault])  # type: ignore[arg-type]
     swarm = SwarmConfig(agents=AGENTS, policy="lease", seed=seed, targets_known=False)
-    with OnBoard(swarm, settings, directory, enable_s=ENABLED_S, flags=flags) as flight:
+    with OnboardSwarm(swarm, settings, directory, enable_s=ENABLED_S, flags=flags) as flight:
         _change_goals(flight, seconds)
         _schedule_fault(flight, fault, seconds, seed)
         modes: list[int] = []

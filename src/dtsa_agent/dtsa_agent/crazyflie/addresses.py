@@ -45,6 +45,16 @@ class LinkError(DtsaError):
     """A connection could not be made; the text says why."""
 
 
+@dataclass(slots=True)
+class LinkCounters:
+    """What a link says about itself."""
+
+    sent: int = 0  # packets but for polls
+    quality: float = 1.0  # 0..1, of the radio
+    rssi: int = 0  # -dBm; 0: the link does not say
+    acknowledged: float = float("-inf")  # s, monotonic: when anything last came, or was acknowledged
+
+
 @dataclass(frozen=True, slots=True)
 class Address:
     """One Crazyflie's address, with cflib's defaults written out."""
@@ -69,10 +79,7 @@ class Address:
 
 
 def parse_address(uri: str) -> Address:
-    """Read an address.
-
-    :raises ConfigError: cflib would not understand it.
-    """
+    """Read an address; ConfigError: cflib would not understand it."""
     if match := _RADIO.fullmatch(uri):
         channel, node = int(match["channel"] or 2), (match["node"] or "E7E7E7E7E7").upper().rjust(10, "0")
         if channel > LAST_CHANNEL:
@@ -95,15 +102,15 @@ def check_distinct(robots: Sequence[tuple[str, Address]]) -> None:
     :raises ConfigError: two addresses are of one link.
     """
     ports = [(address.scheme, address.port) for _, address in robots]
-    found: dict[str, str] = {}
+    names: dict[str, str] = {}
     for name, address in robots:
         link = address.link
         if address.port and ports.count((address.scheme, address.port)) > 1:
             link = f"{address.scheme} {_resolve(address.host)}:{address.port}"
-        if link in found:
-            allowed = f"a Crazyflie of its own ({found[link]} is reached by the same link)"
+        if link in names:
+            allowed = f"a Crazyflie of its own ({names[link]} is reached by the same link)"
             raise ConfigError(f"robots.{name}.uri", address.uri, allowed)
-        found[link] = name
+        names[link] = name
 
 
 def _resolve(host: str) -> str:

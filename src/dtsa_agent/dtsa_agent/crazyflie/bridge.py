@@ -19,11 +19,11 @@ from dtsa_agent.core.settings.scenario import make_scenario
 
 from .addresses import WATCHDOG_HZ, check_budget, parse_address
 from .link import SIMULATED_RADIO, require_cflib
-from .onboard import BoardOrders, key_of, orders, parameters
-from .safety import Action, SafetyMonitor, Verdict
+from .onboard import OnboardSetup, app_orders, app_parameters, key_of
+from .safety import Action, RequiredAction, SafetyMonitor
 from .settings import SwarmSettings
 from .state import State, VehicleState
-from .vehicle import OFF, Snapshot, Vehicle
+from .vehicle import OFF, CrazyflieVehicle, Snapshot
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
@@ -71,7 +71,7 @@ class Bridge:
         self,
         settings: SwarmSettings,
         log: Callable[[str, str], None],
-        on_state: Callable[[Vehicle, VehicleState], None] | None = None,
+        on_state: Callable[[CrazyflieVehicle, VehicleState], None] | None = None,
     ) -> None:
         self.settings = settings
         station = settings.station
@@ -84,16 +84,16 @@ class Bridge:
         caches = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
         cache = Path(station.toc_cache or caches / "dtsa/crazyflie").expanduser()
         cache.mkdir(parents=True, exist_ok=True)
-        self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state) for r in settings.robots}
-        self._prepare_boards()
-        from .drivers import Radios  # needs cflib
+        self.vehicles = {r.name: CrazyflieVehicle(r, station, cache, log, on_state) for r in settings.robots}
+        self._prepare_apps()
+        from .drivers import DongleSet  # needs cflib
 
-        self.radios = Radios(((r.name, r.address) for r in settings.robots), log)
+        self.radios = DongleSet(((r.name, r.address) for r in settings.robots), log)
         self.radios.keep_spare()
         self.monitor = SafetyMonitor(station.safety)
         self._heartbeat: float | None = None
         self._closing = threading.Event()
-        self._guard = threading.Thread(target=self._watch, name="safety", daemon=True)
+        self._guard = threading.Thread(target=self._run_rules, name="safety", daemon=True)
         self.slowest_tick = 0.0  # s, longest time between two applications of the rules
         self._guard.start()
 
@@ -112,15 +112,15 @@ class Bridge:
                 pass
         return [v.name for v in vehicles if v.state in OFF]
 
-    def _prepare_boards(self) -> None:
+    def _prepare_apps(self) -> None:
         """What agents on board are told, where they steer."""
         if (swarm := self.settings.swarm) is None:
             return
         key, scenario, station = key_of(swarm), make_scenario(swarm), self.settings.station
-        values = parameters(swarm, scenario, station.room_origin_in_world[2])
+        values = app_parameters(swarm, scenario, station.room_origin_in_world[2])
         for vehicle in self.vehicles.values():
             own = {name: vehicle.robot.firmware_params.get(name, value) for name, value in values.items()}
-            vehicle.link.board = BoardOrders(own, orders(swarm, scenario, key), station.on_board.polls_hz)
+            vehicle.link.board = OnboardSetup(own, app_orders(swarm, scenario, key), station.on_board.polls_hz)
 
     def start_agents(self, names: Iterable[str] | None = None) -> str:
         """Start the agents on board of those that are connected, all at once; why some do not start, or ""."""
@@ -155,7 +155,7 @@ class Bridge:
             self._log("error", f"{name}: {problem}")
 
     # -- orders to several ------------------------------------------------------------------------------------------
-    def each(self, names: Iterable[str], order: Callable[[Vehicle], str | None]) -> tuple[bool, str]:
+    def order_each(self, names: Iterable[str], order: Callable[[CrazyflieVehicle], str | None]) -> tuple[bool, str]:
         """Give an order to several; success and why not for those that refused.
 
         With more than one name, those that are not there are skipped: one missing drone must not ground the swarm.
@@ -164,12 +164,12 @@ class Bridge:
         absent = [v for v in vehicles if len(vehicles) > 1 and v.state in (*OFF, State.EMERGENCY, State.LOST)]
         given = [v for v in vehicles if v not in absent]
         refused = [problem for v in given if (problem := order(v))]
-        text = "; ".join([*(f"{v.name} skipped: {v.standing}" for v in absent), *refused])
+        text = "; ".join([*(f"{v.name} skipped: {v.state_text}" for v in absent), *refused])
         if text:
             self._log("warn", text)
         return len(given) > 0 and not refused, text
 
-    def enough(self) -> str:
+    def why_no_takeoff(self) -> str:
         """Why the swarm may not take off; empty if it may."""
         needed = self.settings.station.min_connected
         usable = sum(v.state in (State.READY, State.ARMED, State.FLYING, State.LANDING) for v in self.vehicles.values())
@@ -178,7 +178,7 @@ class Bridge:
         return ""
 
     def land_all(self, reason: str) -> None:
-        """Land whoever flies."""
+        """Land all that fly."""
         for vehicle in self.vehicles.values():
             if vehicle.state in (State.ARMED, State.FLYING):
                 vehicle.land(reason)
@@ -190,7 +190,7 @@ class Bridge:
         for vehicle in self.vehicles.values():
             vehicle.stop(reason)
 
-    def heartbeat(self) -> None:
+    def note_heartbeat(self) -> None:
         """The ground station is alive. From the first one on its silence stops the swarm."""
         self._heartbeat = time.monotonic()
 
@@ -199,7 +199,7 @@ class Bridge:
         self._heartbeat = None
 
     # -- safety -----------------------------------------------------------------------------------------------------
-    def _watch(self) -> None:
+    def _run_rules(self) -> None:
         last = time.monotonic()
         keep_alive = last
         while not self._closing.wait(TICK_S):
@@ -217,13 +217,13 @@ class Bridge:
         vehicles = self.vehicles.values()
         age = None if self._heartbeat is None else now - self._heartbeat
         for vehicle in vehicles if feed else ():
-            vehicle.keep_alive(now, self.settings.station.safety.emergency_watchdog)
-        for verdict in self.monitor.check(now, [v.watched(now) for v in vehicles], age):
-            self._act(verdict, now)
+            vehicle.feed_watchdog(now, self.settings.station.safety.emergency_watchdog)
+        for verdict in self.monitor.check(now, [v.watched_state(now) for v in vehicles], age):
+            self._carry_out(verdict, now)
         for vehicle in vehicles:
             vehicle.tick(now)
 
-    def _act(self, verdict: Verdict, now: float) -> None:
+    def _carry_out(self, verdict: RequiredAction, now: float) -> None:
         action, reason = verdict.action, verdict.reason
         level = "warn" if action in (Action.WARN, Action.HOLD) else "error"
         self._log(level, f"{verdict.name or 'all'}: {verdict.rule}: {reason}: {action.value}")
@@ -234,11 +234,11 @@ class Bridge:
         if action is Action.WARN:
             vehicle.action = reason
         elif action is Action.HOLD:
-            vehicle.hold(reason, stale=True, until_seen=verdict.rule == "positions")
+            vehicle.hold_place(reason, stale=True, until_seen=verdict.rule == "positions")
         elif action is Action.LAND:
             vehicle.land(reason)
         elif action is Action.LOST:
-            vehicle.lose(reason, now)
+            vehicle.declare_lost(reason, now)
         else:
             vehicle.stop(reason)
 
@@ -248,7 +248,7 @@ class Bridge:
         now = time.monotonic()
         return [v.snapshot(now) for v in self.vehicles.values()]
 
-    def in_air(self, now: float) -> list[str]:
+    def names_in_air(self, now: float) -> list[str]:
         """Names of those whose link must not be closed now."""
         return [
             v.name
@@ -264,7 +264,7 @@ class Bridge:
         end = time.monotonic() + self.settings.station.landing_timeout_s
         while True:
             now = time.monotonic()
-            flying = self.in_air(now)
+            flying = self.names_in_air(now)
             for name in flying:  # armed on the ground: nothing to wait for but the lock of the motors
                 vehicle = self.vehicles[name]
                 if vehicle.state == State.ARMED:
@@ -274,8 +274,8 @@ class Bridge:
             time.sleep(TICK_S)
 
     def close(self) -> None:
-        """Close all links in parallel. Whoever still flies is stopped first: a closed link would let it fall anyway."""
-        flying = self.in_air(time.monotonic())
+        """Close all links in parallel. One that flies is stopped first: a closed link would let it fall anyway."""
+        flying = self.names_in_air(time.monotonic())
         for name in flying:
             self.vehicles[name].stop("the bridge ends")
         self._closing.set()

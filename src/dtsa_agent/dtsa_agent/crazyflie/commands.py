@@ -94,10 +94,7 @@ def of_message(kind: str, m: Any, origin: Vector, stamp: float) -> Setpoint:
 
 
 def check_stream(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> None:
-    """Refuse a streamed command that leads out of the room, or is too fast.
-
-    :raises ValueError: why it is refused.
-    """
+    """Refuse a streamed command that leads out of the room, or is too fast; ValueError: why it is refused."""
     if setpoint.speed > fastest_mps:
         limit = f"(station.max_stream_mps is {fastest_mps:g})"
         raise ValueError(f"a command with {setpoint.speed:.2f} m/s is refused {limit}")
@@ -129,7 +126,7 @@ class CommandInput:
             self._warn(f"{self._name}: {error}")
             return
         if not self._controls.command(setpoint):
-            self._warn(f"{self._name}: commands are not accepted now ({self._controls.standing})")
+            self._warn(f"{self._name}: commands are not accepted now ({self._controls.state_text})")
 
 
 class CommandThread:

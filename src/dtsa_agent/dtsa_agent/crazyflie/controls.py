@@ -1,6 +1,6 @@
-"""What a Crazyflie's firmware is told to fly: a stream of commands, a path, a landing, or a velocity without a place.
+"""What a Crazyflie's firmware has to fly: a stream of commands, a path, a landing, or a velocity without a place.
 
-A set-point's way from the graph to the motors, and who may stop it:
+A set-point's way from the graph to the motors, and what may stop it:
 
 1. **Topic.** `commands` reads each vehicle's `cmd_*` topics in a thread of its own, turns a message into a
    :class:`~dtsa_agent.crazyflie.commands.Setpoint`, dated by its publication, and refuses one that is too fast or leads
@@ -10,9 +10,9 @@ A set-point's way from the graph to the motors, and who may stop it:
    capture does not see the vehicle (`paused`), or while a take-off or go-to is flown to its end (`guard_until`). One
    that counts ends whatever else was flown: a braking, an order that is being repeated.
 3. **The link** (`link`) gives it to cflib, whose driver (`drivers`) keeps the newest one until it can be sent.
-4. **When the stream stops.** `safety` looks at the command's age 50 times a second: :meth:`Vehicle.hold` comes first,
-   then :meth:`Vehicle.land`. Both brake by a stream of zero velocity, then give an order to the firmware's high-level
-   commander. The order goes out before the end of the stream, or the motors would stop for a moment.
+4. **When the stream stops.** `safety` checks the command's age 50 times a second: first the vehicle holds its place
+   (`hold_place`), then it lands (`land`). Both brake by a stream of zero velocity, then give an order to the firmware's
+   high-level commander. The order goes out before the end of the stream, or the motors would stop for a moment.
 
 The firmware's high-level commander flies polynomials of degree 7 from rest to rest, whatever the duration. If it is too
 short, the vehicle lags behind its path, and a landing stops the motors at the end of the path, wherever the vehicle is.
@@ -30,8 +30,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from .commands import Setpoint, velocity_world
-from .link import Link, Send
-from .settings import StationSettings
+from .link import CrazyflieLink, Send
+from .settings import GroundStationSettings
 from .state import State, StateMachine, Vector
 
 PEAK = 35 / 16  # largest over mean speed of such a polynomial, at its middle
@@ -74,7 +74,7 @@ def too_short(duration: float, distance: float, limit: float) -> str:
     )
 
 
-def landing_s(distance: float, wanted: float, station: StationSettings) -> float:
+def landing_s(distance: float, wanted: float, station: GroundStationSettings) -> float:
     """Duration (s) of a landing over a distance (m): as wanted (0: at the station's speed), or longer if too short."""
     seconds = wanted if wanted > 0.0 else max(MIN_LAND_S, abs(distance) / station.land_speed_mps)
     return max(seconds, shortest_s(distance, station.max_speed_mps))
@@ -148,7 +148,12 @@ class Controls:
     """The present stream, path, braking or landing of one Crazyflie."""
 
     def __init__(
-        self, link: Link, station: StationSettings, machine: StateMachine, lock: Any, log: Callable[[str], None]
+        self,
+        link: CrazyflieLink,
+        station: GroundStationSettings,
+        machine: StateMachine,
+        lock: Any,
+        log: Callable[[str], None],
     ) -> None:
         self._link, self._station, self._machine, self._lock, self._log = link, station, machine, lock, log
         self.moved = False  # something that makes it fly was sent since it was armed
@@ -165,12 +170,12 @@ class Controls:
         self._landings: list[float] = []  # s: when to repeat a landing that may not have been heard
 
     @property
-    def standing(self) -> str:
+    def state_text(self) -> str:
         """The vehicle's state, and why it is in it."""
         return f"{self._machine.state.name.lower()}: {self._machine.reason}"
 
     def reset(self) -> None:
-        """A new connection."""
+        """Begin anew, with a new connection."""
         self.overruled = self.paused = self.streaming = self.held = False
         self._command_time = -math.inf
         self._blind = None
@@ -263,7 +268,7 @@ class Controls:
         """It is heard: no landing is repeated."""
         self._landings.clear()
 
-    def land_again(self, height: float, now: float) -> None:
+    def repeat_due_landing(self, height: float, now: float) -> None:
         """Order the landing from a height (m) once more, when it is time."""
         if self._landings and now >= self._landings[0]:
             self._landings.pop(0)
@@ -272,40 +277,31 @@ class Controls:
 
     # -- without a place --------------------------------------------------------------------------------------------
     @property
-    def blind(self) -> bool:
-        """Whether it is steered without a place."""
-        return self._blind is not None
-
-    @property
     def sinks_blindly(self) -> bool:
         """Whether it sinks without a place."""
         return self._blind is not None and self._blind[0][2] < 0.0
 
-    def see_again(self) -> None:
-        """Places count again."""
+    def end_blind_flight(self) -> None:
+        """Let places count again."""
         self._blind = None
 
-    def stand_blindly(self, now: float) -> None:
-        """Zero velocity, whatever the estimate says."""
-        self._steer_blindly(STANDSTILL, math.inf, now)
-
-    def sink_blindly(self, height: float, now: float) -> None:
-        """Sink by velocity alone for as long as the last known height (m) takes, and some more."""
-        self._steer_blindly((0.0, 0.0, -SINK_MPS), now + height / SINK_MPS + SINK_MORE_S, now)
-
-    def _steer_blindly(self, velocity: Vector, until: float, now: float) -> None:
-        self._brake, self._blind = None, (velocity, until)
-        self.held, self.streaming = False, True
+    def fly_blindly(self, now: float, sink_from: float | None = None) -> None:
+        """Stand still by velocity alone; `sink_from`: or sink for as long as this height (m) takes, and some more."""
+        self._blind = STANDSTILL, math.inf
+        if sink_from is not None:
+            self._blind = (0.0, 0.0, -SINK_MPS), now + sink_from / SINK_MPS + SINK_MORE_S
+        self._brake, self.held, self.streaming = None, False, True
         self.delivery.cancel()
-        self._link.stream(velocity_world(velocity, 0.0, now))
+        self._link.stream(velocity_world(self._blind[0], 0.0, now))
 
-    def go_on_blindly(self, in_air: bool, seen: Vector | None, now: float) -> None:
-        """The next packet of a stream that needs no place; the motors stop once the vehicle must be down.
+    def continue_blind_flight(self, in_air: bool, seen: Vector | None, now: float) -> bool:
+        """Send the next packet of a stream that needs no place; the motors stop once the vehicle must be down.
 
         :param seen: m, world, where motion capture sees it; None: not at all.
+        :returns: False: it is not steered without a place.
         """
         if self._blind is None:
-            return
+            return False
         velocity, until = self._blind
         if not in_air:
             self._blind = None
@@ -314,3 +310,4 @@ class Controls:
             self._link.order(end_of_stream)  # with nothing to fly the end of the stream stops the motors
         else:
             self._link.stream(velocity_world(velocity, 0.0, now))
+        return True

@@ -37,7 +37,7 @@ from cflib.crtp.crtpstack import CRTPPacket
 from cflib.crtp.exceptions import WrongUriType
 from cflib.drivers.crazyradio import Crazyradio, get_serials
 
-from .addresses import ANY, BITRATES, Address, parse_address
+from .addresses import ANY, BITRATES, Address, LinkCounters, parse_address
 
 Report = Callable[[str, str], None]  # level and line
 COMMAND, SETPOINT, POSITION, REQUEST, EMPTY = "command", "setpoint", "position", "request", "empty"
@@ -48,7 +48,7 @@ HEADER, UP_BIT, DOWN_BIT = 0xF3, 0x08, 0x04
 # By the supervisor's port, and by the localization's, where firmware before protocol version 12 has them.
 EMERGENCY, WATCHDOG = (b"\x91\x03", b"\x61\x03"), (b"\x91\x04", b"\x61\x04")
 END_OF_STREAM, HIGH_LEVEL, LEGACY_SETPOINT = 0x71, 0x80, 0x30
-COMMAND_LIFE_S, MOST_COMMANDS = 1.0, 20  # one that waited longer would take somebody by surprise
+COMMAND_LIFE_S, MOST_COMMANDS = 1.0, 20  # one that waited longer comes unexpected
 DEAF_S = 0.25  # nothing acknowledged for that long, though the dongle asks all the time
 RELAXED_S, BUSY_POLLS = 0.01, 10  # pause between polls once so many in a row were answered with nothing
 ABSENT_S, ABSENT_POLL_S = 1.0, 0.02  # pause between polls of one that has not answered for that long
@@ -57,7 +57,7 @@ LATE_ANSWERS = 3  # a dongle that does not answer so often has gone
 CLOSE_S = 0.3  # longest wait at the end for commands that have not been sent
 BROADCAST = (0xFF, 0xE7, 0xE7, 0xE7, 0xE7)  # every Crazyflie listens to it, and acknowledges nothing
 ROUNDS, PAUSE_S = 25, 0.02  # of an emergency stop by broadcast, and the time between two
-FOREIGN_SHARE, FOREIGN_PACKETS = 0.25, 200  # so many packets repeated, of the last so many: somebody else sends
+FOREIGN_SHARE, FOREIGN_PACKETS = 0.25, 200  # so many packets repeated, of the last so many: another program sends
 
 
 def kind_of(packet: bytes) -> str:
@@ -79,16 +79,14 @@ class Mailbox:
         self._requests: deque[bytes] = deque()
         self._newest: dict[str, tuple[bytes, float]] = {}
         self._turn = 0
-        self.replaced = 0  # set-points that a newer one overtook
 
-    def put(self, packet: bytes) -> None:
+    def add(self, packet: bytes) -> None:
         """Add a packet; an order ends the stream of set-points, an emergency stop empties the box."""
         kind, start = kind_of(packet), bytes((packet[0] & HEADER, *packet[1:2]))
         with self._lock:
             if kind == REQUEST:
                 self._requests.append(packet)
             elif kind != COMMAND:
-                self.replaced += kind == SETPOINT and kind in self._newest
                 self._newest[kind] = packet, time.monotonic()
             elif start not in WATCHDOG or all(packet != waiting for waiting, _ in self._commands):
                 if start in EMERGENCY:
@@ -98,7 +96,7 @@ class Mailbox:
                     self._newest.pop(SETPOINT, None)
                 self._commands.append((packet, time.monotonic()))
 
-    def take(self, kind: str = "") -> tuple[str, bytes] | None:
+    def pop(self, kind: str = "") -> tuple[str, bytes] | None:
         """Return the next packet, of one kind or of any, and its kind; None: there is none."""
         with self._lock:
             now = time.monotonic()
@@ -115,13 +113,13 @@ class Mailbox:
                     return turn, self._requests.popleft() if turn == REQUEST else self._newest.pop(turn)[0]
         return None
 
-    def put_back(self, request: bytes) -> None:
+    def return_request(self, request: bytes) -> None:
         """Return a request that may not have arrived."""
         with self._lock:
             self._requests.appendleft(request)
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether nothing waits."""
         return not (self._commands or self._requests or self._newest)
 
@@ -136,31 +134,27 @@ class _Driver(CRTPDriver):  # type: ignore[misc]
 
     def __init__(self) -> None:
         super().__init__()
-        self.mailbox = Mailbox()
-        self.sent = 0  # packets but for polls
-        self.quality: float | None = None  # 0..1; None: the link does not say
-        self.rssi = 0  # -dBm; 0: the link does not say
-        self.acknowledged = float("-inf")  # s, monotonic: when anything last came, or was acknowledged
-        self.on_heard: Callable[[], None] = lambda: None  # the end of a silence
-        self.on_setpoint: Callable[[], None] = lambda: None  # a set-point has been sent
+        self.counters = LinkCounters()
+        self.on_silence_end: Callable[[], None] = lambda: None  # the end of a silence
+        self.on_setpoint_sent: Callable[[], None] = lambda: None  # a set-point has been sent
 
     def limit(self, polls_hz: float) -> None:
         """From now on send at most so many packets a second."""
 
-    def _heard(self, now: float) -> None:
-        silent, self.acknowledged = now - self.acknowledged > DEAF_S, now
+    def _acknowledge(self, now: float) -> None:
+        silent, self.counters.acknowledged = now - self.counters.acknowledged > DEAF_S, now
         if silent:
-            self.on_heard()
+            self.on_silence_end()
 
 
 class RadioDriver(_Driver):
     """One Crazyflie's link over a dongle. `due`, `exchange` and what they call belong to the dongle's thread."""
 
-    def __init__(self, radios: Radios) -> None:
+    def __init__(self, radios: DongleSet) -> None:
         super().__init__()
-        self._radios = radios
+        self._radios, self.mailbox = radios, Mailbox()
         self._arrived: queue.Queue[Any] = queue.Queue()
-        self._dongle: Dongle | None = None
+        self._dongle: DongleThread | None = None
         self._pending: tuple[str, bytes] | None = None  # sent, and not acknowledged
         self._tries, self._safelink, self._up, self._down = 0, False, 0, 0
         self._last = self._least_s = 0.0  # s: when a packet last went (monotonic), and shortest time between two
@@ -186,7 +180,7 @@ class RadioDriver(_Driver):
 
     def send_packet(self, pk: Any) -> bool:
         if pk.header & 0xF0 != LEGACY_SETPOINT and self._dongle is not None:
-            self.mailbox.put(bytes((pk.header,)) + bytes(pk.data))
+            self.mailbox.add(bytes((pk.header,)) + bytes(pk.data))
             self._dongle.wake()
         return True
 
@@ -199,14 +193,18 @@ class RadioDriver(_Driver):
         dongle, self._dongle = self._dongle, None
         if dongle is not None:
             dongle.remove(self)
-        self._arrived.put(None)  # wakes whoever waits for a packet
+        self._arrived.put(None)  # wakes a thread that waits for a packet
 
     def due(self, now: float) -> float:
         """Return when the next packet goes (s, monotonic)."""
         pause = self._least_s
-        if now - self.acknowledged > ABSENT_S and self._tries >= SAFELINK_TRIES and not self.mailbox.has_commands:
+        if (
+            now - self.counters.acknowledged > ABSENT_S
+            and self._tries >= SAFELINK_TRIES
+            and not self.mailbox.has_commands
+        ):
             pause = max(pause, ABSENT_POLL_S)
-        elif self._pending is None and self.mailbox.empty and self._empty_polls > BUSY_POLLS:
+        elif self._pending is None and self.mailbox.is_empty and self._empty_polls > BUSY_POLLS:
             pause = max(pause, RELAXED_S)
         return self._last + pause
 
@@ -235,22 +233,22 @@ class RadioDriver(_Driver):
         """Return the packet to send, and whether with either bit."""
         box, pending, both = self.mailbox, self._pending, False
         if pending is None:
-            pending = box.take() or (EMPTY, NULL)
-        elif now - self.acknowledged > DEAF_S:
-            if (command := box.take(COMMAND)) is not None:
+            pending = box.pop() or (EMPTY, NULL)
+        elif now - self.counters.acknowledged > DEAF_S:
+            if (command := box.pop(COMMAND)) is not None:
                 if pending[0] == REQUEST:
-                    box.put_back(pending[1])
+                    box.return_request(pending[1])
                 pending, both = command, True
             elif pending[0] in (SETPOINT, POSITION):
                 pending = EMPTY, NULL  # too old
         elif pending[0] in (SETPOINT, POSITION):
-            pending = box.take(pending[0]) or pending
+            pending = box.pop(pending[0]) or pending
         self._pending = pending
         return pending[1], both
 
     def _answered(self, data: bytes, repeated: int, greeting: bool) -> None:
         self._scores.append(10 - repeated)
-        self.quality = sum(self._scores) / len(self._scores) / 10
+        self.counters.quality = sum(self._scores) / len(self._scores) / 10
         kind, fresh = EMPTY, bool(data)
         if greeting:
             self._safelink, fresh = data == SAFELINK, False
@@ -260,22 +258,22 @@ class RadioDriver(_Driver):
             if self._safelink:
                 fresh = fresh and data[0] & DOWN_BIT == self._down * DOWN_BIT
                 self._up, self._down = 1 - self._up, 1 - self._down if fresh else self._down
-        self.sent += kind != EMPTY
+        self.counters.sent += kind != EMPTY
         if kind == SETPOINT:
-            self.on_setpoint()
-        self._heard(time.monotonic())
+            self.on_setpoint_sent()
+        self._acknowledge(time.monotonic())
         if not fresh:
             return
         nothing = data[0] & HEADER == HEADER
         self._empty_polls = self._empty_polls + (kind == EMPTY) if nothing else 0
         if nothing and data[1:2] == b"\x01" and len(data) > 2:
-            self.rssi = data[2]
+            self.counters.rssi = data[2]
         if not nothing or not self._established:  # cflib wants one packet, whatever it is, to begin
             self._established = True
             self._arrived.put(CRTPPacket(data[0], list(data[1:])))
 
 
-class Dongle(threading.Thread):
+class DongleThread(threading.Thread):
     """A Crazyradio, and the thread that serves its Crazyflies in turn.
 
     :param radio: number or serial.
@@ -285,7 +283,7 @@ class Dongle(threading.Thread):
     def __init__(self, radio: str, report: Report, names: dict[str, str]) -> None:
         super().__init__(name=f"radio {radio}", daemon=True)
         self.radio, self._report, self._names = radio, report, names
-        self.foreign = False  # somebody else sends on the channel, as it seems
+        self.foreign = False  # another radio sends on the channel, as it seems
         self._condition = threading.Condition()
         self._links: list[RadioDriver] = []
         self._stops: deque[tuple[int, int]] = deque()  # channel and data rate of packets that stop all
@@ -389,8 +387,11 @@ class Dongle(threading.Thread):
         self._device.set_ack_enable(True)
 
     def _lose(self, why: str) -> None:
-        served = ", ".join(self._names.get(link.address.link, link.address.uri) for link in self._links)
-        self._report("error", f"radio {self.radio} ({self._serial}) is gone ({why}): {served or 'nobody'} out of reach")
+        links = {link.address.link for link in self._links}
+        served = ", ".join(name for link, name in self._names.items() if link in links)  # in the file's order
+        self._report(
+            "error", f"radio {self.radio} ({self._serial}) is gone ({why}): {served or 'no vehicle'} out of reach"
+        )
         device, self._device = self._device, None
         with contextlib.suppress(Exception):
             device.close()
@@ -430,9 +431,9 @@ class UdpDriver(_Driver):
         except OSError as problem:
             self._fail(str(problem))
             return True
-        self.sent += 1
+        self.counters.sent += 1
         if kind_of(data) == SETPOINT:
-            self.on_setpoint()
+            self.on_setpoint_sent()
         return True
 
     def receive_packet(self, wait: float = 0) -> Any:
@@ -449,23 +450,23 @@ class UdpDriver(_Driver):
             return None
         if not data:
             return None
-        self._heard(time.monotonic())
+        self._acknowledge(time.monotonic())
         return CRTPPacket(data[0], list(data[1:]))
 
     def _fail(self, problem: str) -> None:
         error, self._error = self._error, None
-        if error is not None and self._socket is not None and self.acknowledged == float("-inf"):
+        if error is not None and self._socket is not None and self.counters.acknowledged == float("-inf"):
             error(problem)
 
     def close(self) -> None:
         sock, self._socket = self._socket, None
         if sock is not None:
             with contextlib.suppress(OSError):
-                sock.shutdown(socket.SHUT_RDWR)  # wakes whoever waits for a packet
+                sock.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for a packet
             sock.close()
 
 
-class Radios:
+class DongleSet:
     """The dongles of one bridge; cflib opens links by the drivers above until it is closed.
 
     :param robots: names and addresses.
@@ -477,18 +478,18 @@ class Radios:
         self._names = {address.link: name for name, address in robots}
         self._addresses = [address for _, address in robots if address.radio]
         self._report = report
-        self._dongles: dict[str, Dongle] = {}
+        self._dongles: dict[str, DongleThread] = {}
         self._lock = threading.Lock()
         self._drivers: list[Any] = [partial(RadioDriver, self), UdpDriver]
-        self.spare: Dongle | None = None  # that no link uses: emergency stops go by it
+        self.spare: DongleThread | None = None  # that no link uses: emergency stops go by it
         cflib.crtp.CLASSES[:0] = self._drivers
 
-    def dongle(self, address: Address) -> Dongle:
+    def dongle(self, address: Address) -> DongleThread:
         """Return the dongle of an address; raises an error if it is not there."""
         radio = self._radio(address)
         with self._lock:
             if radio not in self._dongles:
-                self._dongles[radio] = Dongle(radio, self._report, self._names)
+                self._dongles[radio] = DongleThread(radio, self._report, self._names)
             return self._dongles[radio]
 
     def _radio(self, address: Address) -> str:
@@ -509,7 +510,7 @@ class Radios:
             if used & {str(number), serial}:
                 continue
             try:
-                self.spare = Dongle(str(number), self._report, self._names)
+                self.spare = DongleThread(str(number), self._report, self._names)
             except Exception as error:  # in use by another program, or no right to use it
                 self._report("warn", f"radio {number} cannot be used for emergency stops: {error}")
                 continue
@@ -519,7 +520,7 @@ class Radios:
 
     @property
     def foreign(self) -> list[str]:
-        """Dongles on whose channels somebody else seems to send."""
+        """Dongles on whose channels another radio seems to send."""
         return [name for name, dongle in sorted(self._dongles.items()) if dongle.foreign]
 
     def stop_all(self) -> None:

@@ -22,20 +22,20 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 
-from .addresses import LinkError
+from .addresses import LinkCounters, LinkError
 from .commands import Setpoint
-from .onboard import BoardOrders
-from .positions import Settling
+from .onboard import START, OnboardSetup, send_order
+from .positions import SettlingCheck
 from .settings import RobotSettings
 from .state import LOG_VARIABLES, Vector, VehicleState, decode_log
 
 SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Crazyradios, for simulation only
-FIRST_ANSWER_S = 2.0  # over the air nothing else tells that nobody is there
-HEARD_S = 0.25  # something came or was acknowledged within that time: it can be heard
-NOBODY_S = 10.0  # simulated Crazyflies that are started at the same time take so long to listen
+FIRST_ANSWER_S = 2.0  # over the air nothing else shows that no Crazyflie is there
+AUDIBLE_S = 0.25  # something came or was acknowledged within that time: it can be heard
+CLOSED_PORT_S = 10.0  # simulated Crazyflies that are started at the same time take so long to listen
 PAUSE_S = (0.1, 0.5)  # first and longest pause before a closed port is asked again
 LOG_ORDER_S = 0.4  # nothing logged for that long, though it can be heard: the log is ordered anew
-REFUSED = f"[Errno {errno.ECONNREFUSED}]"  # in the words of a driver: nobody listens there
+REFUSED = f"[Errno {errno.ECONNREFUSED}]"  # in a driver's words: the port is closed
 VARIANCES = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
 PLACE = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")
 INITIAL = ("kalman.initialX", "kalman.initialY", "kalman.initialZ")
@@ -46,10 +46,7 @@ Send = Callable[[Any], None]  # gives an order to cflib's `Crazyflie`
 
 
 def require_cflib() -> None:
-    """Load cflib's drivers, once.
-
-    :raises ConfigError: cflib is not installed; the text says how to get it.
-    """
+    """Load cflib's drivers, once; ConfigError: cflib is not installed; the text says how to get it."""
     if importlib.util.find_spec("cflib") is None:
         allowed = "an installed cflib: tools/dtsa setup --extra cflib, or pip install cflib==0.1.34"
         raise ConfigError("cflib", "not installed", allowed)
@@ -93,7 +90,7 @@ class LogClock:
         return min(now, stamp_ms / 1000 + self._offset)
 
 
-class Opening:
+class ConnectionAttempt:
     """How far a connection has come, as cflib's threads say."""
 
     def __init__(self) -> None:
@@ -106,14 +103,14 @@ class Opening:
         self.settled.set()
 
 
-class Link:
+class CrazyflieLink:
     """One Crazyflie's connection and log.
 
     :param cache: folder for the tables of variables.
     :param on_state: called with each decoded log packet and when it was logged (s, monotonic), in a thread of cflib's.
     :param on_broken: called with a reason when the connection ends by itself, in a thread of cflib's.
     :param on_answer: called with the first byte of a high-level order and the firmware's answer, in such a thread.
-    :param seen: where motion capture sees the Crazyflie (m, world); None: not at all.
+    :param measured_place: where motion capture sees the Crazyflie (m, world); None: not at all.
     """
 
     def __init__(
@@ -123,29 +120,29 @@ class Link:
         on_state: Callable[[VehicleState, float], None],
         on_broken: Callable[[str], None],
         on_answer: Callable[[int, int], None],
-        settling: Settling,
-        seen: Callable[[], Vector | None],
+        settling: SettlingCheck,
+        measured_place: Callable[[], Vector | None],
     ) -> None:
         self.robot = robot
         self.connected = False
         self.received = 0  # log packets
+        self.counters = LinkCounters()
         self.firmware: tuple[int, str] | None = None  # version of its protocol, and revision; None: never connected
-        self.board: BoardOrders | None = None  # what the app on board is told; None: there is none
+        self.board: OnboardSetup | None = None  # what the app on board is told; None: there is none
         self.guarded = False  # the firmware's emergency watchdog wants to be fed as soon as it can be
         self.latencies: deque[float] = deque(maxlen=500)  # s, from the arrival of a command to its packet
         self.send_times: deque[float] = deque(maxlen=200)  # s, monotonic, of the last streamed commands
-        self._cache, self._settling, self._seen = cache, settling, seen
+        self._cache, self._settling, self._measured_place = cache, settling, measured_place
         self._on_state, self._on_broken, self._on_answer = on_state, on_broken, on_answer
         self._closed = False
         self._cf: Any = None
         self._driver: Any = None  # ours; None: one of cflib's own
-        self._opening = Opening()
+        self._attempt = ConnectionAttempt()
         self._stamp = 0.0  # s, monotonic, of the last streamed command
         self._log_clock = LogClock()
-        self._last_packet = self._heard_since = self._log_ordered = -math.inf  # s, monotonic
+        self._audible_since = self._log_ordered = -math.inf  # s, monotonic
         self._log_order_s = LOG_ORDER_S
         self._log_block: Any = None
-        self._sent_before = 0  # packets of connections that have ended
 
     # -- what goes out ----------------------------------------------------------------------------------------------
     @property
@@ -159,9 +156,9 @@ class Link:
             self._stamp = setpoint.stamp
             getattr(cf.commander, f"send_{setpoint.kind}_setpoint")(*setpoint.arguments)
             if self._driver is None:
-                self._streamed()
+                self._count_setpoint()
 
-    def _streamed(self) -> None:
+    def _count_setpoint(self) -> None:
         """A set-point has been sent."""
         now = time.monotonic()
         self.latencies.append(now - self._stamp)
@@ -196,36 +193,16 @@ class Link:
             self._on_broken(f"could not send: {error}")
 
     # -- what is known of it ----------------------------------------------------------------------------------------
-    @property
-    def sent(self) -> int:
-        """Packets to it."""
-        return self._sent_before + (0 if self._driver is None else self._driver.sent)
-
-    @property
-    def replaced(self) -> int:
-        """Set-points that a newer one overtook."""
-        return 0 if self._driver is None else self._driver.mailbox.replaced
-
-    @property
-    def quality(self) -> float | None:
-        """Quality of the radio, 0..1; None: there is no radio."""
-        return None if self._driver is None else self._driver.quality
-
-    @property
-    def rssi(self) -> int:
-        """Strength of the signal, -dBm; 0: there is no radio."""
-        return 0 if self._driver is None else self._driver.rssi
-
     def silence(self, now: float) -> float:
         """Seconds since something was acknowledged, or came; infinite before that."""
-        return now - (self._last_packet if self._driver is None else self._driver.acknowledged)
+        return now - self.counters.acknowledged
 
     # -- connection -------------------------------------------------------------------------------------------------
     def connect(self) -> str:
         """Connect, in the calling thread; why it failed, or an empty text."""
         attempts, attempt, reason = self.robot.connect_attempts, 1, "the link has been closed"
         pause, longest = PAUSE_S
-        patience = time.monotonic() + min(NOBODY_S, self.robot.connect_timeout_s)
+        patience = time.monotonic() + min(CLOSED_PORT_S, self.robot.connect_timeout_s)
         while attempt <= attempts and not self._closed:
             try:
                 self._connect()
@@ -234,35 +211,32 @@ class Link:
                 reason = f"attempt {attempt} of {attempts}: {error}"
                 self._drop()
                 # A closed port says so at once: that is no attempt as long as it may be about to be opened.
-                nobody = REFUSED in reason and time.monotonic() < patience
-                attempt += not nobody
-                if nobody:
+                closed = REFUSED in reason and time.monotonic() < patience
+                attempt += not closed
+                if closed:
                     time.sleep(pause)
                     pause = min(2 * pause, longest)
         return reason
 
     def _connect(self) -> None:
-        """Connect once.
-
-        :raises LinkError: it did not work.
-        """
+        """Connect once; LinkError: it did not work."""
         from cflib.crazyflie import Crazyflie
 
         self._drop()
         limit = self.robot.connect_timeout_s
         deadline = time.monotonic() + limit
         cf = Crazyflie(rw_cache=str(self._cache))
-        opening = self._watch(cf)
+        attempt = self._watch(cf)
         self._cf = cf
         cf.open_link(self.robot.uri)
         self._watch_driver(cf.link)
-        settled = opening.settled.wait(min(FIRST_ANSWER_S, limit))
+        settled = attempt.settled.wait(min(FIRST_ANSWER_S, limit))
         if self.robot.address.radio and not settled and self.silence(time.monotonic()) == math.inf:
             raise LinkError(f"no answer on the air within {FIRST_ANSWER_S:g} s")
-        if not opening.settled.wait(max(0.0, deadline - time.monotonic())):
+        if not attempt.settled.wait(max(0.0, deadline - time.monotonic())):
             raise LinkError(f"no answer within {limit:g} s")
-        if opening.failure:
-            raise LinkError(opening.failure)
+        if attempt.failure:
+            raise LinkError(attempt.failure)
         if self.robot.address.radio:
             cf.link_statistics.stop()  # its pings take air; elsewhere they tell that the Crazyflie is there
         for name, value in self.robot.firmware_params.items():
@@ -278,41 +252,44 @@ class Link:
         self._start_log(cf, max(deadline, time.monotonic() + 2.0))
         self.connected = True
 
-    def _watch(self, cf: Any) -> Opening:
+    def _watch(self, cf: Any) -> ConnectionAttempt:
         """Take note of all that cflib says about a connection, from its threads."""
         from cflib.crtp.crtpstack import CRTPPort
 
-        opening = self._opening = Opening()
+        attempt = self._attempt = ConnectionAttempt()
 
         def broken(uri: str, message: str) -> None:
             reason = message.partition("\n\n")[0].replace("\n", " ")
-            opening.fail(reason)
+            attempt.fail(reason)
             if self._cf is cf and self.connected:
                 self.connected = False
                 self._on_broken(f"link broken: {reason}")
 
         def received(packet: Any) -> None:
-            self._last_packet = time.monotonic()
+            if self._driver is None:
+                self.counters.acknowledged = time.monotonic()
 
         def answered(packet: Any) -> None:
             if len(packet.data) > 3:
                 self._on_answer(packet.data[0], packet.data[3])
 
-        cf.fully_connected.add_callback(lambda uri: opening.settled.set())
+        cf.fully_connected.add_callback(lambda uri: attempt.settled.set())
         cf.connection_failed.add_callback(broken)
         cf.connection_lost.add_callback(broken)
         cf.packet_received.add_callback(received)
         cf.add_port_callback(CRTPPort.SETPOINT_HL, answered)
-        return opening
+        return attempt
 
     def _watch_driver(self, driver: Any) -> None:
-        if hasattr(driver, "mailbox"):
+        if hasattr(driver, "counters"):
             self._driver = driver
-            driver.on_heard, driver.on_setpoint = self._heard, self._streamed
+            driver.counters.sent += self.counters.sent
+            self.counters = driver.counters
+            driver.on_silence_end, driver.on_setpoint_sent = self._end_silence, self._count_setpoint
 
-    def _heard(self) -> None:
+    def _end_silence(self) -> None:
         """The end of a silence: the firmware's watchdog has not much time left."""
-        self._heard_since = time.monotonic()
+        self._audible_since = time.monotonic()
         if self.guarded:
             self.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
 
@@ -328,10 +305,10 @@ class Link:
         def sample(stamp: int, values: dict[str, float], block: Any) -> None:
             x, y, z = (values[name] for name in PLACE)
             vx, vy, vz = (values[name] for name in VARIANCES)
-            if self._settling.sample((x, y, z), (vx, vy, vz), self._seen()):
+            if self._settling.sample((x, y, z), (vx, vy, vz), self._measured_place()):
                 settled.set()
 
-        if (place := self._seen()) is not None:  # the filter begins where it is seen, not metres away
+        if (place := self._measured_place()) is not None:  # the filter begins where it is seen, not metres away
             for name, value in zip(INITIAL, place, strict=True):
                 cf.param.set_value(name, value)
         cf.param.set_value("kalman.resetEstimation", 1)
@@ -361,7 +338,7 @@ class Link:
         if cf is None or board is None:
             return "not connected"
         try:
-            board.start(cf)
+            send_order(cf, START)
         except LinkError as error:
             return str(error)
         if self._driver is not None:
@@ -400,8 +377,8 @@ class Link:
 
     def order_log(self, now: float) -> None:
         """Order the log anew, if it can be heard now (s, monotonic): the firmware ends it in a gap of a second."""
-        last = max(self._log_clock.last, self._heard_since, self._log_ordered)
-        if self.silence(now) > HEARD_S or now - last < self._log_order_s:
+        last = max(self._log_clock.last, self._audible_since, self._log_ordered)
+        if self.silence(now) > AUDIBLE_S or now - last < self._log_order_s:
             return
         self._log_ordered = now
 
@@ -420,12 +397,12 @@ class Link:
         if cf is not None:
             with contextlib.suppress(Exception):  # whatever state it is in, we are done with it
                 cf.close_link()
-        self._sent_before, self._driver = self.sent, None
+        self._driver, self.counters = None, LinkCounters(sent=self.counters.sent)
 
     def close(self) -> None:
         """Close the connection. Never in flight."""
         self._closed = True
-        self._opening.fail("the link has been closed")
+        self._attempt.fail("the link has been closed")
         self._drop()
 
 

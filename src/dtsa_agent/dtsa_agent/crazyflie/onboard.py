@@ -1,4 +1,4 @@
-"""The protocol on board of Crazyflies: its settings, and what the ground tells each one's app before it starts.
+"""The protocol on board of Crazyflies: its settings, and what the ground sends to each app before it starts.
 
 The app is in `dtsa_agent/onboard`; what its parameters and orders mean stands in docs/how-to/on-board.md.
 """
@@ -22,7 +22,7 @@ from dtsa_agent.keys import VARIABLE, authenticator, check_session
 
 from .addresses import LinkError
 
-MOST = 20  # agents: BOARD_AGENTS of board.h
+MAX_AGENTS = 20  # AGENTS_MAX of app.c
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")  # numbers of libdtsa
 ESTIMATORS = ("hold", "linear")
 KEY_BYTES = 16
@@ -38,11 +38,11 @@ _SET_S = 5.0  # longest wait until all parameters are confirmed
 
 
 @dataclass(frozen=True, slots=True)
-class OnBoardSettings(Settings):
+class OnboardSettings(Settings):
     """Crazyflies that steer themselves."""
 
     swarm: Mapping[str, Any] = setting(
-        {}, "settings of the swarm, as for `dtsa simulate`, without `agents`; empty: nobody steers itself",
+        {}, "settings of the swarm, as for `dtsa simulate`, without `agents`; empty: none steers itself",
         kind="structure",
     )  # fmt: skip
     polls_hz: float = setting(
@@ -63,13 +63,10 @@ class OnBoardSettings(Settings):
         return bool(self.swarm)
 
 
-def check_on_board(swarm: SwarmConfig) -> None:
-    """Refuses a swarm that the app cannot be.
-
-    :raises ConfigError: if it cannot.
-    """
-    if swarm.agents > MOST:
-        raise ConfigError("agents", swarm.agents, f"1 to {MOST} on board")
+def check_onboard_swarm(swarm: SwarmConfig) -> None:
+    """Refuse a swarm that the app cannot fly; ConfigError: it cannot."""
+    if swarm.agents > MAX_AGENTS:
+        raise ConfigError("agents", swarm.agents, f"1 to {MAX_AGENTS} on board")
     if swarm.policy not in POLICIES:
         raise ConfigError("policy", swarm.policy, ", ".join(POLICIES))
     if swarm.estimator not in ESTIMATORS:
@@ -77,8 +74,8 @@ def check_on_board(swarm: SwarmConfig) -> None:
     check_fits(swarm, PORT)
 
 
-def parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[str, float]:
-    """The app's parameters of a swarm, by their full names; it may not steer yet.
+def app_parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[str, float]:
+    """Return the app's parameters of a swarm, by their full names; it may not steer yet.
 
     :param scenario: starts and goals; the app lands outside of the box around them.
     :param height: m, of the frame map's origin above the floor.
@@ -87,7 +84,7 @@ def parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[st
         "enable": 0, "agents": swarm.agents, "policy": POLICIES.index(swarm.policy),
         "estimator": ESTIMATORS.index(swarm.estimator),
         "header": int.from_bytes(header_of(swarm, PORT) or b"\0\0", "little"), "steps": swarm.steps,
-        # In this slot all begin together with a policy that nobody can join.
+        # In this slot all begin together with a policy that no agent can join.
         "beginSlot": 0 if swarm.policy_row.may_join else 4 * swarm.turn_every * swarm.agents,
         "goalsKnown": swarm.targets_known,
         "slotUs": swarm.slot_ns // 1000, "flightUs": FLIGHT_US, "seed": swarm.seed, "height": height,
@@ -100,38 +97,33 @@ def parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[st
 
 
 def key_of(swarm: SwarmConfig) -> bytes:
-    """The key of frames that are sealed on board, from the environment; none if they are not sealed.
+    """Return the key of signed frames, from the environment; empty if frames are not signed.
 
     :raises ConfigError: there is no key of 16 bytes, or no session.
     """
     check_session(swarm)
-    found = authenticator(swarm)
-    key = b"" if found is None else found.key_and_session[0]
-    if found is not None and len(key) != KEY_BYTES:
+    signing = authenticator(swarm)
+    key = b"" if signing is None else signing.key_and_session[0]
+    if signing is not None and len(key) != KEY_BYTES:
         raise ConfigError(VARIABLE, f"{len(key)} bytes", f"{KEY_BYTES} bytes on board")
     return key
 
 
-def orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[bytes]:
-    """Packets of the app channel before the start: draw of lots, everybody's places, key.
-
-    :param key: 16 bytes, where frames are sealed.
-    """
-    found = [b"D" + struct.pack("<Q", policy_key(swarm.seed))]
+def app_orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[bytes]:
+    """Return the packets of the app channel before the start: draw of lots, places of all agents, key (16 bytes)."""
+    packets = [b"D" + struct.pack("<Q", policy_key(swarm.seed))]
     for letter, places in ((b"F", scenario.start), (b"T", scenario.target)):
         for k in range(swarm.agents):
-            found.append(letter + struct.pack("<B3d", k + 1, *(float(places[i, k]) for i in range(3))))
+            packets.append(letter + struct.pack("<B3d", k + 1, *(float(places[i, k]) for i in range(3))))
     if swarm.auth:
-        found.append(b"K" + key + struct.pack("<Q", swarm.auth_session))
-    return found
+        packets.append(b"K" + key + struct.pack("<Q", swarm.auth_session))
+    return packets
 
 
-class BoardOrders:
-    """For one Crazyflie; called in its link's worker, on the ground.
+class OnboardSetup:
+    """What one Crazyflie's app gets on the ground: parameters by `group.name`, and packets of the app channel.
 
-    :param parameters: values of the app's parameters, `group.name`.
-    :param orders: packets of the app channel before the start.
-    :param polls_hz: Hz, how often the Crazyflie is asked once its agent has started.
+    :param polls_hz: Hz, how often the Crazyflie is polled once its agent has started.
     """
 
     def __init__(self, parameters: Mapping[str, float], orders: Sequence[bytes], polls_hz: float) -> None:
@@ -139,10 +131,7 @@ class BoardOrders:
         self.polls_hz = polls_hz
 
     def prepare(self, cf: Any) -> None:
-        """Everything that the app has to know before its agent starts.
-
-        :raises LinkError: it has no such app, or the app refuses.
-        """
+        """Send all that the app needs before its agent starts; LinkError: it has no such app, or the app refuses."""
         missing, confirmed = set(self._parameters), threading.Event()
 
         def note(name: str, value: str) -> None:
@@ -161,33 +150,27 @@ class BoardOrders:
         for name in self._parameters:
             cf.param.remove_update_callback(*name.split("."), cb=note)
         for order in self._orders:
-            _tell(cf, order)
-
-    def start(self, cf: Any) -> None:
-        """Its agent starts: it listens, then takes part.
-
-        :raises LinkError: it does not.
-        """
-        _tell(cf, START)
+            send_order(cf, order)
 
 
-def _tell(cf: Any, order: bytes) -> None:
+def send_order(cf: Any, order: bytes) -> None:
+    """Send an order to the app on board, and wait for its answer; LinkError: there is none, or it refuses."""
     answers: list[bytes] = []
     answered = threading.Event()
 
-    def hear(data: Any) -> None:
+    def receive(data: Any) -> None:
         if bytes(data)[:1] == order[:1]:
             answers.append(bytes(data))
             answered.set()
 
-    cf.appchannel.packet_received.add_callback(hear)
+    cf.appchannel.packet_received.add_callback(receive)
     try:
         for _ in range(_TIMES):
             cf.appchannel.send_packet(order)
             if answered.wait(_ANSWER_S):
                 break
     finally:
-        cf.appchannel.packet_received.remove_callback(hear)
+        cf.appchannel.packet_received.remove_callback(receive)
     if not answers:
         raise LinkError(f"the app on board does not answer order {order[:1].decode()}")
     if answers[0][1:2] != b"\x01":

@@ -77,7 +77,7 @@ class MeasuredPose:
     time: float  # of its arrival
 
 
-class Refused(Exception):
+class RefusedPose(Exception):
     """A pose is not believed: the kind, and why."""
 
     def __init__(self, kind: str, reason: str) -> None:
@@ -86,11 +86,11 @@ class Refused(Exception):
 
 
 @dataclass(slots=True)
-class Tracker:
+class PoseTracker:
     """Poses of one Crazyflie.
 
     :param origin: m, where the Crazyflies' world sees the origin of `map`.
-    :param room: nobody is outside of it (m, map), but for a margin; None: no limits.
+    :param room: corners of the box (m, map) outside of which no pose is believed, but for a margin; None: no limits.
     """
 
     settings: PositionSettings
@@ -118,12 +118,12 @@ class Tracker:
             if self.last is not None:
                 try:
                     self._check_follows(self.last, seen, flying=flying)
-                except Refused:
+                except RefusedPose:
                     agrees = self._agrees_elsewhere(seen)
                     if flying or not agrees:
                         raise
                     self._least_lag = math.inf  # perhaps the clock was set
-        except Refused as problem:
+        except RefusedPose as problem:
             self.refused[problem.kind] += 1
             self.reason = str(problem)
             return self.reason
@@ -138,44 +138,41 @@ class Tracker:
         self, position: Vector, orientation: Quaternion, frame: str, stamp: float, now: float, *, flying: bool
     ) -> MeasuredPose:
         if frame not in ("", "world", "map"):
-            raise Refused("frame", f"frame_id {frame!r:.40} is neither world nor map")
+            raise RefusedPose("frame", f"frame_id {frame!r:.40} is neither world nor map")
         if not all(math.isfinite(v) for v in (*position, *orientation)):
-            raise Refused("not finite", "the pose is not finite")
+            raise RefusedPose("not finite", "the pose is not finite")
         place = to_world(position, self.origin) if frame == "map" else position
         if outside := outside_room(place, self.origin, self.room):
-            raise Refused("outside", outside)
+            raise RefusedPose("outside", outside)
         norm = math.sqrt(sum(c * c for c in orientation))
         if self.settings.send != EXTPOSE:
             return MeasuredPose(place, None, stamp, now)
         if abs(norm - 1.0) > NORM_TOLERANCE:
-            raise Refused("quaternion", f"the quaternion has length {norm:.3g}, not 1 (send: extpos needs none)")
+            raise RefusedPose("quaternion", f"the quaternion has length {norm:.3g}, not 1 (send: extpos needs none)")
         x, y, z, w = (c / norm for c in orientation)
         tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
         if flying and tilt > TILT_RAD:
-            raise Refused("attitude", f"it is tilted by {math.degrees(tilt):.0f} degrees in flight")
+            raise RefusedPose("attitude", f"it is tilted by {math.degrees(tilt):.0f} degrees in flight")
         return MeasuredPose(place, (x, y, z, w), stamp, now)
 
     def _check_follows(self, last: MeasuredPose, seen: MeasuredPose, *, flying: bool) -> None:
-        """Whether a pose can follow the one before.
-
-        :raises Refused: it cannot.
-        """
+        """Whether a pose can follow the one before; RefusedPose: it cannot."""
         passed = seen.time - last.time
         if seen.stamp and last.stamp and seen.stamp <= last.stamp:
-            raise Refused("stamp", f"its stamp is {last.stamp - seen.stamp:.3f} s before that of the last one")
+            raise RefusedPose("stamp", f"its stamp is {last.stamp - seen.stamp:.3f} s before that of the last one")
         late = seen.time - seen.stamp - self._least_lag
         if seen.stamp and late > self.settings.late_s + DRIFT * passed:
-            raise Refused("late", f"it comes {late * 1000:.0f} ms later than the fastest one")
+            raise RefusedPose("late", f"it comes {late * 1000:.0f} ms later than the fastest one")
         if flying and (seen.position, seen.orientation) == (last.position, last.orientation):
-            raise Refused("repeated", f"the same pose again, {passed:.2f} s later: motion capture stands still")
+            raise RefusedPose("repeated", f"the same pose again, {passed:.2f} s later: motion capture stands still")
         jump = math.dist(seen.position, last.position)
         if jump > self.settings.jump_m + FASTEST_MPS * passed:
-            raise Refused("jump", f"it jumps by {jump:.2f} m within {passed:.2f} s")
+            raise RefusedPose("jump", f"it jumps by {jump:.2f} m within {passed:.2f} s")
         if seen.orientation is not None and last.orientation is not None:
             same = abs(sum(a * b for a, b in zip(seen.orientation, last.orientation, strict=True)))
             turn = 2.0 * math.acos(min(1.0, same))
             if turn > TURN_RAD + FASTEST_RADPS * passed:
-                raise Refused("attitude", f"it turns by {math.degrees(turn):.0f} degrees within {passed:.2f} s")
+                raise RefusedPose("attitude", f"it turns by {math.degrees(turn):.0f} degrees within {passed:.2f} s")
 
     def _agrees_elsewhere(self, seen: MeasuredPose) -> bool:
         """Whether enough poses agree on another place, or another time, than the last one that was believed."""
@@ -195,7 +192,7 @@ class Tracker:
         self._next_send = max(self._next_send, now - 0.9 * period) + period
         return True
 
-    def was_sent(self, seen: MeasuredPose, wall: float) -> None:
+    def count_sent(self, seen: MeasuredPose, wall: float) -> None:
         """A pose has gone to its Crazyflie at a Unix time (s)."""
         self.sent += 1
         if seen.stamp:
@@ -238,7 +235,7 @@ def outside_room(place: Vector, origin: Vector, room: Room | None) -> str:
 
 
 @dataclass(slots=True)
-class Settling:
+class SettlingCheck:
     """Decides when the estimator of a Crazyflie has settled after it was restarted.
 
     With motion capture: when its place agrees with where the vehicle is seen. Without: when its variances are small.

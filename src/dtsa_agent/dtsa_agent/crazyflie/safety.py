@@ -115,7 +115,7 @@ def outside_fence(place: Vector, safety: SafetySettings, origin: Vector) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Watched:
+class WatchedVehicle:
     """What the rules need to know about one vehicle."""
 
     name: str
@@ -132,7 +132,7 @@ class Watched:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class RequiredAction:
     """Something has to be done."""
 
     name: str  # the vehicle; empty: all
@@ -155,7 +155,9 @@ class SafetyMonitor:
         self._active: set[tuple[str, str, Action]] = set()
         self._low_since: dict[tuple[str, str], float] = {}
 
-    def check(self, now: float, vehicles: Sequence[Watched], heartbeat_age: float | None) -> list[Verdict]:
+    def check(
+        self, now: float, vehicles: Sequence[WatchedVehicle], heartbeat_age: float | None
+    ) -> list[RequiredAction]:
         """Return what has to be done now.
 
         :param heartbeat_age: s since the ground station's last heartbeat; None: it has never been heard.
@@ -168,17 +170,17 @@ class SafetyMonitor:
                 "positions": _waits(v, v.position_age, s.position_age_s, s.position_land_s, UNSEEN),
                 "estimate": _estimate(v),
             }  # fmt: skip
-            found += [Verdict(v.name, action, rule, why) for rule, all_ in rules.items() for action, why in all_]
-        found += [Verdict(name, Action.LAND, "distance", why) for name, why in self._too_close(vehicles)]
+            found += [RequiredAction(v.name, action, rule, why) for rule, all_ in rules.items() for action, why in all_]
+        found += [RequiredAction(name, Action.LAND, "distance", why) for name, why in self._too_close(vehicles)]
         silent = heartbeat_age if s.heartbeat_s and (heartbeat_age or 0.0) > s.heartbeat_s else None
         if silent is not None and any(v.state in MAY_MOVE for v in vehicles):
             why = f"no heartbeat of the ground station for {silent:.2f} s"
-            found.append(Verdict("", Action.STOP_ALL, "heartbeat", why))
+            found.append(RequiredAction("", Action.STOP_ALL, "heartbeat", why))
         fresh = [v for v in found if (v.name, v.rule, v.action) not in self._active]
         self._active = {(v.name, v.rule, v.action) for v in found}
         return fresh
 
-    def _fence(self, v: Watched) -> Demands:
+    def _fence(self, v: WatchedVehicle) -> Demands:
         s = self.settings
         if not s.geofence or v.state not in IN_AIR or v.position is None:
             return
@@ -189,7 +191,7 @@ class SafetyMonitor:
         if worst > max(s.geofence_tolerance_m, s.geofence_hard_m):
             yield Action.STOP, reason
 
-    def _battery(self, now: float, v: Watched) -> Demands:
+    def _battery(self, now: float, v: WatchedVehicle) -> Demands:
         for level, limit in (("warning", v.battery_warning), ("critical", v.battery_critical)):
             key, warns = (v.name, level), level == "warning"
             if not self.settings.battery or v.state in UNKNOWN or v.battery >= limit:
@@ -200,12 +202,12 @@ class SafetyMonitor:
                 reason = f"battery {v.battery:.2f} V, {level} limit {limit:.2f} V"
                 yield Action.WARN if warns else Action.LAND, reason
 
-    def _link(self, v: Watched) -> Demands:
+    def _link(self, v: WatchedVehicle) -> Demands:
         limit = self.settings.link_age_s
         if limit and v.state not in UNKNOWN and v.log_age > limit:
             yield Action.LOST, f"no log packet for {v.log_age:.2f} s (limit {limit:.2f} s)"
 
-    def _too_close(self, vehicles: Sequence[Watched]) -> Iterator[tuple[str, str]]:
+    def _too_close(self, vehicles: Sequence[WatchedVehicle]) -> Iterator[tuple[str, str]]:
         limit = self.settings.min_distance_m
         flying = [(v, v.position) for v in vehicles if v.state in IN_AIR and v.position is not None]
         for (a, here), (b, there) in combinations(flying if limit else (), 2):
@@ -215,7 +217,7 @@ class SafetyMonitor:
                         yield one.name, f"{distance:.2f} m from {other.name} (limit {limit:.2f} m)"
 
 
-def _estimate(v: Watched) -> Demands:
+def _estimate(v: WatchedVehicle) -> Demands:
     if v.wrong and v.state in IN_AIR:
         if v.state != State.LANDING:
             yield Action.HOLD, v.wrong
@@ -223,7 +225,7 @@ def _estimate(v: Watched) -> Demands:
             yield Action.LAND, v.wrong
 
 
-def _waits(v: Watched, age: float | None, hold_s: float, land_s: float, what: str) -> Demands:
+def _waits(v: WatchedVehicle, age: float | None, hold_s: float, land_s: float, what: str) -> Demands:
     """One that flies waits for something, since `age` (s; None: never): hold it (0 s: never), then land it."""
     if hold_s and age is not None and v.state == State.FLYING and age > hold_s:
         yield Action.HOLD, f"{what} for {age:.2f} s"

@@ -24,9 +24,10 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting, settings_of
 from dtsa_agent.core.settings.scenario import make_scenario
+from dtsa_agent.yaml_file import read_yaml
 
 from .addresses import Address, RadioLoad, RadioUser, check_distinct, parse_address, radio_loads
-from .onboard import OnBoardSettings, check_on_board
+from .onboard import OnboardSettings, check_onboard_swarm
 from .positions import NONE, PositionSettings
 from .safety import SafetySettings
 from .state import Vector
@@ -78,27 +79,18 @@ class RobotSettings(Settings):
     command_rate_hz: float = setting(50.0, "rate of the streamed commands", unit="Hz", minimum=1, maximum=100)
     log_rate_hz: float = setting(50.0, "rate of the state log", unit="Hz", minimum=4, maximum=100)
     connect_timeout_s: float = setting(
-        20.0,
-        "time for one attempt to connect; a first connection over the air reads the tables of variables",
-        unit="s",
-        minimum=0.2,
-        maximum=300,
-    )
+        20.0, "time for one attempt to connect; a first connection over the air reads the tables of variables",
+        unit="s", minimum=0.2, maximum=300,
+    )  # fmt: skip
     connect_attempts: int = setting(
-        3,
-        "attempts to connect; before the first one counts, a closed UDP port is asked for up to 10 s",
-        minimum=1,
-        maximum=100,
-    )
+        3, "attempts to connect; before the first one counts, a closed UDP port is asked for up to 10 s",
+        minimum=1, maximum=100,
+    )  # fmt: skip
     estimator_timeout_s: float = setting(10.0, "time for the estimator to settle", unit="s", minimum=0.1, maximum=300)
     estimator_variance_m2: float = setting(
-        0.01,
-        "largest variance of a settled estimator without motion capture; a Flow deck alone, which knows no place, "
-        "stays at 100",
-        unit="m²",
-        minimum=1e-6,
-        maximum=1000,
-    )
+        0.01, "largest variance of a settled estimator without motion capture; a Flow deck alone, which knows no "
+        "place, stays at 100", unit="m²", minimum=1e-6, maximum=1000,
+    )  # fmt: skip
     reset_estimator: bool = setting(True, "restart the Kalman filter and wait until it has settled")
     battery: BatterySettings = nested(BatterySettings, "voltages in flight")
     firmware_params: Mapping[str, float] = setting(
@@ -118,15 +110,13 @@ class RobotSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class StationSettings(Settings):
+class GroundStationSettings(Settings):
     """The ground station."""
 
     min_connected: int = setting(
-        1,
-        "fewer usable Crazyflies than this: the bridge ends (exit code 1), no vehicle takes off",
-        minimum=1,
-        maximum=1000,
-    )
+        1, "fewer usable Crazyflies than this: the bridge ends (exit code 1), no vehicle takes off",
+        minimum=1, maximum=1000,
+    )  # fmt: skip
     room_origin_in_world: Vector = setting(
         (0.0, 0.0, 0.95), "where the Crazyflies' world sees the origin of the frame map, the room's centre", unit="m"
     )
@@ -143,7 +133,7 @@ class StationSettings(Settings):
     priority: int = setting(20, "real-time priority of bridge, agents and ground station, where allowed; 0: none",
         minimum=0, maximum=90)  # fmt: skip
     positions: PositionSettings = nested(PositionSettings, "positions from motion capture")
-    on_board: OnBoardSettings = nested(OnBoardSettings, "Crazyflies that steer themselves by the app on board")
+    on_board: OnboardSettings = nested(OnboardSettings, "Crazyflies that steer themselves by the app on board")
     safety: SafetySettings = nested(SafetySettings, "the safety rules")
 
 
@@ -152,21 +142,18 @@ class SwarmSettings:
     """Everything in the swarm's YAML."""
 
     robots: tuple[RobotSettings, ...]  # the enabled ones, by id
-    station: StationSettings
+    station: GroundStationSettings
     unused: tuple[str, ...] = ()  # keys of the file that mean nothing here
 
     @property
     def swarm(self) -> SwarmConfig | None:
-        """What the agents on board share; None: the bridge steers.
-
-        :raises ConfigError: it is not usable.
-        """
+        """What the agents on board share; None: the bridge steers; ConfigError: it is not usable."""
         given = self.station.on_board
         if not given.on:
             return None
         with named("station.on_board.swarm"):
             swarm = SwarmConfig.from_dict({**given.swarm, "agents": len(self.robots)})
-            check_on_board(swarm)
+            check_onboard_swarm(swarm)
             return swarm
 
     @property
@@ -180,8 +167,7 @@ class SwarmSettings:
     def summary(self) -> list[str]:
         """What the file asks for, in lines: radios, and keys that mean nothing here."""
         lines = [str(load) for load in self.loads]
-        wired = sum(not robot.address.radio for robot in self.robots)
-        if wired:
+        if wired := sum(not robot.address.radio for robot in self.robots):
             lines.append(f"{wired} Crazyflies without a radio (udp, usb): no budget")
         if self.unused:
             lines.append(f"not used: {', '.join(self.unused)}")
@@ -189,20 +175,12 @@ class SwarmSettings:
 
 
 def load_swarm(path: Path) -> SwarmSettings:
-    """Read and check a swarm's YAML.
-
-    :raises ConfigError: the file cannot be read, or something in it is not usable.
-    """
-    from dtsa_agent.yaml_file import read_yaml
-
+    """Read and check a swarm's YAML; ConfigError: the file cannot be read, or something in it is not usable."""
     return parse_swarm(read_yaml(path, "config"))
 
 
 def parse_swarm(data: object) -> SwarmSettings:
-    """Settings from the contents of a swarm's YAML.
-
-    :raises ConfigError: something in it is not usable.
-    """
+    """Settings from the contents of a swarm's YAML; ConfigError: something in it is not usable."""
     top = _mapping("config", data)
     unused = [str(key) for key in top if key not in SECTIONS]
     types = _mapping("robot_types", top.get("robot_types"))
@@ -223,7 +201,7 @@ def parse_swarm(data: object) -> SwarmSettings:
     robots.sort(key=lambda robot: robot.id)
     check_distinct([(robot.name, robot.address) for robot in robots])
     with named("station"):
-        station = StationSettings.from_dict(_given(_mapping("station", top.get("station"))))
+        station = GroundStationSettings.from_dict(_without_empty(_mapping("station", top.get("station"))))
     if station.min_connected > len(robots):
         raise ConfigError("station.min_connected", station.min_connected, f"1 to {len(robots)}, the enabled robots")
     settings = SwarmSettings(tuple(robots), station, tuple(dict.fromkeys(unused)))
@@ -233,10 +211,7 @@ def parse_swarm(data: object) -> SwarmSettings:
 
 
 def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
-    """Whether robots and station fit to agents on board.
-
-    :raises ConfigError: they do not.
-    """
+    """Check that robots and station fit to agents on board."""
     station, (x, y, _) = settings.station, settings.station.room_origin_in_world
     rate = station.on_board.polls_hz
     if station.positions.on:
@@ -269,8 +244,8 @@ def _mapping(field: str, value: object) -> dict[str, Any]:
     return value
 
 
-def _given(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What is given; an empty section is one that was left out."""
+def _without_empty(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out sections without content."""
     return {key: value for key, value in values.items() if value is not None}
 
 
@@ -302,15 +277,12 @@ def _merged(
             unused += [f"{where}.battery.{key}" for key in battery if key not in BATTERY_KEYS]
             values = values | {"battery": {key: value for key, value in battery.items() if key in BATTERY_KEYS}}
         unused += [f"{where}.{key}" for key in values if key not in known]
-        result = _merge(result, _given({key: value for key, value in values.items() if key in known}))
+        result = _merge(result, _without_empty({key: value for key, value in values.items() if key in known}))
     return result
 
 
 def _ids(robots: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """Agents' ids by the robots' names: those given, else numbers of names that are 1 to N, else the file's order.
-
-    :raises ConfigError: two robots have one id.
-    """
+    """Agents' ids by the robots' names: those given, else numbers of names that are 1 to N, else the file's order."""
     numbers = {name: int(match[0]) if (match := NUMBER.search(name)) else 0 for name in robots}
     if sorted(numbers.values()) != list(range(1, len(robots) + 1)):
         numbers = {name: place for place, name in enumerate(robots, 1)}

@@ -30,16 +30,8 @@ Quaternion = tuple[float, float, float, float]  # x, y, z, w
 
 # One log block of 20 bytes has everything; a block may have 26.
 LOG_VARIABLES = (
-    "stateEstimateZ.x",
-    "stateEstimateZ.y",
-    "stateEstimateZ.z",
-    "stateEstimateZ.vx",
-    "stateEstimateZ.vy",
-    "stateEstimateZ.vz",
-    "stateEstimateZ.quat",
-    "pm.vbatMV",
-    "supervisor.info",
-)
+    *(f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz", "quat")), "pm.vbatMV", "supervisor.info",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +51,8 @@ def decode_log(values: Mapping[str, float]) -> VehicleState:
     :param values: by the names in `LOG_VARIABLES`, in the firmware's units.
     """
     x, y, z, vx, vy, vz, quaternion, millivolt, info = (values[name] for name in LOG_VARIABLES)
-    return VehicleState(
-        (x * 0.001, y * 0.001, z * 0.001),
-        (vx * 0.001, vy * 0.001, vz * 0.001),
-        decompress_quaternion(int(quaternion)),
-        millivolt * 0.001,
-        int(info),
-    )
+    place, velocity = (x * 0.001, y * 0.001, z * 0.001), (vx * 0.001, vy * 0.001, vz * 0.001)
+    return VehicleState(place, velocity, decompress_quaternion(int(quaternion)), millivolt * 0.001, int(info))
 
 
 def decompress_quaternion(bits: int) -> Quaternion:
@@ -76,14 +63,14 @@ def decompress_quaternion(bits: int) -> Quaternion:
     """
     largest = bits >> 30
     q = [0.0, 0.0, 0.0, 0.0]
-    rest = 1.0
+    remainder = 1.0
     for i in (3, 2, 1, 0):
         if i != largest:
             value = (bits & 511) * (math.sqrt(0.5) / 511)
             q[i] = -value if bits & 512 else value
-            rest -= value * value
+            remainder -= value * value
             bits >>= 10
-    q[largest] = math.sqrt(max(rest, 0.0))
+    q[largest] = math.sqrt(max(remainder, 0.0))
     return q[0], q[1], q[2], q[3]
 
 
@@ -94,26 +81,17 @@ def yaw_of(q: Quaternion) -> float:
 
 
 def to_world(place: Vector, origin: Vector) -> Vector:
-    """From the frame `map` (the room's centre) to the Crazyflies' own world.
-
-    :param origin: m, where the world sees the origin of `map`.
-    """
+    """From the frame `map` (the room's centre) to the Crazyflies' world, which sees the origin of `map` at `origin`."""
     return place[0] + origin[0], place[1] + origin[1], place[2] + origin[2]
 
 
 def to_map(place: Vector, origin: Vector) -> Vector:
-    """From the Crazyflies' own world to the frame `map`; the inverse of `to_world`.
-
-    :param origin: (3,) m, world, where the map's origin is.
-    """
+    """From the Crazyflies' world to the frame `map`; the inverse of `to_world`."""
     return place[0] - origin[0], place[1] - origin[1], place[2] - origin[2]
 
 
 def outside_by(place: Vector, low: Vector, high: Vector) -> list[tuple[float, str]]:
-    """How far a place is outside a box along each axis, m (negative: inside), with the axis's name.
-
-    :param low: lower corner, m, same frame. :param high: m, upper corner.
-    """
+    """How far a place is outside a box along each axis, m (negative: inside), and the axis's name."""
     return [(max(a - p, p - b), axis) for p, a, b, axis in zip(place, low, high, "xyz", strict=True)]
 
 
@@ -123,20 +101,14 @@ def place_text(place: Vector) -> str:
 
 
 def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
-    """A vector of the world as the body sees it.
-
-    :param q: orientation of the body (x, y, z, w). :param v: (3,) any vector, in the world's axes.
-    """
+    """Turn a vector from the world's axes into those of a body with this orientation."""
     x, y, z, w = -q[0], -q[1], -q[2], q[3]
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
     return (v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx)
 
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
-    """A vector of the body as the world sees it; the inverse of `rotate_inverse`.
-
-    :param q: orientation of the body (x, y, z, w). :param v: (3,) any vector, in the body's axes.
-    """
+    """Turn a vector from the axes of a body with this orientation into the world's."""
     return rotate_inverse((-q[0], -q[1], -q[2], q[3]), v)
 
 
@@ -190,10 +162,7 @@ class StateMachine:
         self._stopped = False  # an emergency stop was sent
 
     def go(self, state: State, reason: str) -> None:
-        """Enter a state.
-
-        :raises LocalProtocolError: there is no way from the present state to that one.
-        """
+        """Enter a state; LocalProtocolError: there is no way from the present state to that one."""
         if state == self.state:
             return
         if state not in ALLOWED[self.state]:
@@ -232,22 +201,13 @@ class StateMachine:
             self.go(S.LOST, reason)
 
     def observe(self, info: int) -> None:
-        """The supervisor's bits in a log packet.
-
-        :param info: the bits, as the firmware logs them.
-        """
+        """Follow the supervisor's bits in a log packet."""
         if self.state in (S.DISCONNECTED, S.EMERGENCY):
             return
-        for bit, reason in (
-            (IS_LOCKED, "locked after an emergency stop"),
-            (IS_TUMBLED, "tumbled"),
-            (IS_CRASHED, "crashed"),
-        ):
-            if info & bit:
-                self.go(S.EMERGENCY, reason)
-                return
-        if self._stopped:
-            self.go(S.EMERGENCY, self.reason)
+        troubles = (IS_LOCKED, "locked after an emergency stop"), (IS_TUMBLED, "tumbled"), (IS_CRASHED, "crashed")
+        reasons = [reason for bit, reason in troubles if info & bit]
+        if reasons or self._stopped:
+            self.go(S.EMERGENCY, reasons[0] if reasons else self.reason)
             return
         self.arms_itself = bool(info & AUTO_ARM)
         back = "heard again" if self.state == S.LOST else ""

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from .controls import GO_TO, SLOW_MPS, TAKEOFF, Controls, end_of_stream, landing_s, too_short
-from .link import Link, Send
+from .link import CrazyflieLink, Send
 from .onboard import ENABLE
-from .positions import EXTPOSE, Settling, Tracker
-from .safety import EstimateWatch, Watched, outside_fence
-from .settings import RobotSettings, StationSettings
+from .positions import EXTPOSE, PoseTracker, SettlingCheck
+from .safety import EstimateWatch, WatchedVehicle, outside_fence
+from .settings import GroundStationSettings, RobotSettings
 from .state import HL_ACTIVE, IN_AIR, IS_FLYING, Quaternion, State, StateMachine, Vector, VehicleState, to_map, yaw_of
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
@@ -34,7 +34,6 @@ class Snapshot:
     """State of one vehicle for status and diagnostics."""
 
     name: str
-    id: int
     state: State
     reason: str
     vehicle: VehicleState | None
@@ -45,13 +44,12 @@ class Snapshot:
     sent: int
     received: int
     refused: int  # streamed commands that were not for this state
-    replaced: int  # streamed commands that a newer one overtook
     latency_p99: float  # s; 0 before the first command
     command_hz: float
-    tracker: Tracker | None = None  # None: there is no motion capture
+    tracker: PoseTracker | None = None  # None: there is no motion capture
 
 
-class Vehicle:
+class CrazyflieVehicle:
     """One Crazyflie. Times (`now`) are s, monotonic; places are m, world. Orders return why not, or an empty text.
 
     :param cache: folder for cflib's tables.
@@ -61,10 +59,10 @@ class Vehicle:
     def __init__(
         self,
         robot: RobotSettings,
-        station: StationSettings,
+        station: GroundStationSettings,
         cache: Path,
         log: Callable[[str, str], None],
-        on_state: Callable[[Vehicle, VehicleState], None] | None = None,
+        on_state: Callable[[CrazyflieVehicle, VehicleState], None] | None = None,
     ) -> None:
         self.robot, self.station, self.name = robot, station, robot.name
         self.lock = threading.RLock()
@@ -78,12 +76,14 @@ class Vehicle:
         self._complained = -math.inf
         safety, positions, origin = station.safety, station.positions, station.room_origin_in_world
         room = (safety.geofence_min, safety.geofence_max) if safety.geofence else None
-        self.tracker = Tracker(positions, origin, room) if positions.on else None  # None: there is no motion capture
+        self.tracker = (
+            PoseTracker(positions, origin, room) if positions.on else None
+        )  # None: there is no motion capture
         self._watch = EstimateWatch(safety.estimate_jump_m, safety.estimate_freeze_s, safety.estimate_error_m)
-        settling = Settling(robot.estimator_variance_m2, origin, room, positions.agree_m if positions.on else None)
-        seen = lambda: self._seen(time.monotonic())  # noqa: E731
-        self.link = Link(robot, cache, self._received, self._broken, self._answered, settling, seen)
-        self.controls = Controls(self.link, station, self.machine, self.lock, self._note)
+        settling = SettlingCheck(robot.estimator_variance_m2, origin, room, positions.agree_m if positions.on else None)
+        seen = lambda: self._measured_place(time.monotonic())  # noqa: E731
+        self.link = CrazyflieLink(robot, cache, self._on_state, self._on_broken, self._on_answer, settling, seen)
+        self.controls = Controls(self.link, station, self.machine, self.lock, self._log_info)
 
     @property
     def state(self) -> State:
@@ -91,14 +91,14 @@ class Vehicle:
         return self.machine.state
 
     @property
-    def standing(self) -> str:
+    def state_text(self) -> str:
         """Its state in words, and the way out of one that has no other."""
         if self.state == State.EMERGENCY:
             return f"emergency ({self.machine.reason}): switch it off and on, then call /{self.name}/reconnect"
         return self.state.name.lower()
 
     # -- what comes in ----------------------------------------------------------------------------------------------
-    def _note(self, text: str) -> None:
+    def _log_info(self, text: str) -> None:
         self._log("info", f"{self.name}: {text}")
 
     def _changed(self, before: State, state: State, reason: str) -> None:
@@ -108,7 +108,7 @@ class Vehicle:
         if before == State.LANDING and state == State.ARMED:
             self.link.order(lambda cf: cf.supervisor.send_arming_request(False))
 
-    def _received(self, state: VehicleState, now: float) -> None:
+    def _on_state(self, state: VehicleState, now: float) -> None:
         """A log packet with values that were taken at this time."""
         with self.lock:
             self.last = state
@@ -117,17 +117,17 @@ class Vehicle:
                 return  # it delivers what it logged in the gap; what comes next is new
             if not self._watch.wrong:
                 self._trusted_height = max(state.position[2], 0.0)
-            if self._watch.update(state, now, self._seen(now), flying=bool(state.info & IS_FLYING)):
+            if self._watch.update(state, now, self._measured_place(now), flying=bool(state.info & IS_FLYING)):
                 self._log("error", f"{self.name}: {self._watch.wrong}")
             if self.state not in OFF:
                 before = self.state
                 self.machine.observe(state.info)
                 if before == State.LOST != self.state:
-                    self._heard_again(state)
+                    self._resume_after_gap(state)
         if self._publish is not None:
             self._publish(self, state)
 
-    def _heard_again(self, state: VehicleState) -> None:
+    def _resume_after_gap(self, state: VehicleState) -> None:
         """The end of a gap: the orders that were given in it may have been lost."""
         self.controls.end_repeats()
         if self.state != State.LANDING:
@@ -138,22 +138,22 @@ class Vehicle:
             self.controls.delivery.cancel()
             self.link.order(end_of_stream)
         elif drifts or not self.controls.delivery.landing:
-            self._note("heard again: brakes and lands")
+            self._log_info("heard again: brakes and lands")
             self.controls.streaming = True
-            self._brake_then(self._come_down)
+            self._brake_then(self._descend)
 
-    def _answered(self, code: int, result: int) -> None:
+    def _on_answer(self, code: int, result: int) -> None:
         with self.lock:
             problem = self.controls.delivery.answered(code, result)
         if problem:
             self._log("warn", f"{self.name}: {problem}")
 
-    def _broken(self, reason: str) -> None:
+    def _on_broken(self, reason: str) -> None:
         with self.lock:
             self.machine.silent(reason)
 
-    def see(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> None:
-        """A pose from motion capture (see `Tracker.offer`): checked, and passed on to the Crazyflie."""
+    def receive_pose(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> None:
+        """A pose from motion capture (see `PoseTracker.offer`): checked, and passed on to the Crazyflie."""
         tracker, now = self.tracker, time.monotonic()
         if tracker is None:
             return
@@ -168,11 +168,11 @@ class Vehicle:
             self.link.send_position(position_order(tracker))
 
     # -- what is known of it ----------------------------------------------------------------------------------------
-    def _seen(self, now: float) -> Vector | None:
+    def _measured_place(self, now: float) -> Vector | None:
         """Where motion capture sees it; None: not at all, or not any more."""
         return None if self.tracker is None else self.tracker.place(now)
 
-    def _misplaced(self) -> str:
+    def _why_misplaced(self) -> str:
         """Why its motors may not start: it does not know where it stands. Empty if it does."""
         if self.tracker is None or self.last is None:
             return ""
@@ -191,12 +191,12 @@ class Vehicle:
         """Seconds since the last log packet; infinite before the first one."""
         return now - self._log_times[-1] if self._log_times else math.inf
 
-    def watched(self, now: float) -> Watched:
+    def watched_state(self, now: float) -> WatchedVehicle:
         """What the safety rules need."""
         with self.lock:
             battery, last, wrong = self.robot.battery, self.last, self._watch.wrong
-            place = self._seen(now) if wrong else None if last is None else last.position
-            return Watched(
+            place = self._measured_place(now) if wrong else None if last is None else last.position
+            return WatchedVehicle(
                 self.name, self.state, None if place is None else to_map(place, self.station.room_origin_in_world),
                 math.inf if last is None else last.battery, battery.flight_warning, battery.flight_landing,
                 self.log_age(now), None if wrong else self.controls.setpoint_age(now),
@@ -208,15 +208,13 @@ class Vehicle:
         with self.lock:
             link = self.link
             recent = sum(1 for t in self._log_times if now - t <= WINDOW_S)
-            quality = min(
-                1.0, recent / (self.robot.log_rate_hz * WINDOW_S), 1.0 if link.quality is None else link.quality
-            )
+            quality = min(1.0, recent / (self.robot.log_rate_hz * WINDOW_S), link.counters.quality)
             delays = sorted(link.latencies.copy())
             sends = sum(1 for t in link.send_times.copy() if now - t <= WINDOW_S)
             return Snapshot(
-                self.name, self.robot.id, self.state, self.action, self.last, self.log_age(now),
-                self.controls.command_age(now), quality, link.rssi, link.sent, link.received, self.controls.refused,
-                link.replaced, delays[int(0.99 * (len(delays) - 1))] if delays else 0.0, sends / WINDOW_S, self.tracker,
+                self.name, self.state, self.action, self.last, self.log_age(now), self.controls.command_age(now),
+                quality, link.counters.rssi, link.counters.sent, link.received, self.controls.refused,
+                delays[int(0.99 * (len(delays) - 1))] if delays else 0.0, sends / WINDOW_S, self.tracker,
             )  # fmt: skip
 
     # -- connection -------------------------------------------------------------------------------------------------
@@ -244,21 +242,21 @@ class Vehicle:
         threading.Thread(target=run, name=f"{self.name}-connect", daemon=True).start()
 
     # -- orders -----------------------------------------------------------------------------------------------------
-    def _led(self) -> str:
+    def _why_not_steerable(self) -> str:
         """Why it takes no orders to fly somewhere; empty if it does."""
         if self.state == State.FLYING and not self.controls.overruled:
             return ""
-        return f"{self.name} is {self.standing}" + (f" ({self.action})" if self.controls.overruled else "")
+        return f"{self.name} is {self.state_text}" + (f" ({self.action})" if self.controls.overruled else "")
 
-    def _fly(self, kind: str, action: Send, duration: float, *, again: bool = True) -> None:
+    def _order_flight(self, kind: str, action: Send, duration: float, *, again: bool = True) -> None:
         self.controls.fly(kind, action, duration, time.monotonic(), again=again)
 
     def arm(self, arm: bool) -> str:
         """Let the motors run, or lock them."""
         with self.lock:
             if self.state not in (State.READY, State.ARMED):
-                return f"{self.name} is {self.standing}"
-            if arm and (problem := self._misplaced()):
+                return f"{self.name} is {self.state_text}"
+            if arm and (problem := self._why_misplaced()):
                 return problem
             self.action = "arming" if arm else "disarming"
             self.machine.arm(arm)
@@ -274,7 +272,7 @@ class Vehicle:
         with self.lock:
             arms = self.state == State.READY and self.machine.arms_itself
             if not arms and self.state not in WATCHED_OVER:
-                return f"{self.name} is {self.standing}, not armed"
+                return f"{self.name} is {self.state_text}, not armed"
             if self._watch.wrong:
                 return f"{self.name}: {self._watch.wrong}"
             if not math.isfinite(height):
@@ -283,7 +281,7 @@ class Vehicle:
             critical = self.robot.battery.voltage_critical
             if on_ground and last is not None and last.battery < critical:
                 return f"{self.name}: battery {last.battery:.2f} V (voltage_critical is {critical:g} V)"
-            if on_ground and (problem := self._misplaced()):
+            if on_ground and (problem := self._why_misplaced()):
                 return problem
             x, y, z = (0.0, 0.0, 0.0) if last is None else last.position
             safety, origin = self.station.safety, self.station.room_origin_in_world
@@ -296,32 +294,36 @@ class Vehicle:
             self.controls.overruled, self.controls.moved = False, True
             if self.station.on_board.on:  # the app had been overruled by the last landing: it has to be enabled anew
                 self.link.set_parameter(ENABLE, 0)
-            self.controls.see_again()
+            self.controls.end_blind_flight()
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
             if on_ground or last is None:
                 self.controls.streaming = True  # an old stream may still be in force
-                self._fly(TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration)
+                self._order_flight(
+                    TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration
+                )
             else:  # the firmware takes off from the ground only
                 yaw = yaw_of(last.orientation)
-                self._fly(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
+                self._order_flight(
+                    GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration
+                )
             return ""
 
     def enable(self, on: bool) -> str:
         """Let the agent on board steer, or take the controls back: it then hovers."""
         with self.lock:
-            if on and (problem := self._led()):
+            if on and (problem := self._why_not_steerable()):
                 return problem
             if on and (left := self.controls.guard_until - time.monotonic()) > 0.0:
                 return f"{self.name} still flies its take-off or go_to, for {left:.1f} s"
-            self._note(f"the agent on board {'may steer' if on else 'may not steer any more'}")
+            self._log_info(f"the agent on board {'may steer' if on else 'may not steer any more'}")
             self.link.set_parameter(ENABLE, int(on))
             return ""
 
     def go_to(self, place: Vector, yaw: float, duration: float, relative: bool) -> str:
         """Fly to a place (relative: by an offset) and heading (rad) within a duration (s)."""
         with self.lock:
-            if problem := self._led():
+            if problem := self._why_not_steerable():
                 return problem
             if not all(map(math.isfinite, (*place, yaw, duration))):
                 return f"{self.name}: the goal is not finite"
@@ -336,10 +338,10 @@ class Vehicle:
             def order(cf: Any) -> None:
                 cf.high_level_commander.go_to(*place, yaw, duration, relative)
 
-            self._fly(GO_TO, order, duration, again=not relative)
+            self._order_flight(GO_TO, order, duration, again=not relative)
             return ""
 
-    def hold(self, reason: str, *, stale: bool = False, until_seen: bool = False) -> None:
+    def hold_place(self, reason: str, *, stale: bool = False, until_seen: bool = False) -> None:
         """Stop where it is; the next streamed command takes over again.
 
         A vehicle whose estimate is wrong is only kept from moving, and takes no commands any more.
@@ -353,7 +355,7 @@ class Vehicle:
             self.action = f"hold: {reason}"
             if self._watch.wrong:
                 self.controls.overruled = True
-                self.controls.stand_blindly(time.monotonic())
+                self.controls.fly_blindly(time.monotonic())
                 return
             self.controls.paused = until_seen
 
@@ -362,7 +364,7 @@ class Vehicle:
                     return
                 (x, y, z), yaw = self.last.position, yaw_of(self.last.orientation)
                 z = max(z, LOWEST_HOLD_M)
-                self._fly(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
+                self._order_flight(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
                 self.controls.held = stale
 
             self.controls.held = stale
@@ -385,7 +387,7 @@ class Vehicle:
         with self.lock:
             controls, height = self.controls, height if math.isfinite(height) else 0.0
             if self.state not in (*WATCHED_OVER, State.LOST):
-                return f"{self.name} is {self.standing}"
+                return f"{self.name} is {self.state_text}"
             if self.state == State.ARMED and not controls.moved:
                 return self.arm(False)  # a landing would start the motors
             controls.overruled = True
@@ -397,8 +399,8 @@ class Vehicle:
             self.machine.land(self.action)
             if self._watch.wrong:
                 now = time.monotonic()
-                seen = self._seen(now)
-                controls.sink_blindly(self._trusted_height if seen is None else seen[2], now)
+                seen = self._measured_place(now)
+                controls.fly_blindly(now, self._trusted_height if seen is None else seen[2])
                 return ""
             way = self._height - height
             if 0.0 < duration < (seconds := landing_s(way, duration, self.station)):
@@ -407,10 +409,10 @@ class Vehicle:
                 self._log("warn", longer)
                 if note is not None:
                     note(longer)
-            self._brake_then(lambda: self._come_down(height, duration))
+            self._brake_then(lambda: self._descend(height, duration))
             return ""
 
-    def _come_down(self, height: float = 0.0, duration: float = 0.0) -> None:
+    def _descend(self, height: float = 0.0, duration: float = 0.0) -> None:
         """Straight down from where it is now; parameters as of `land`."""
         self.controls.land(height, self._height - height, duration, time.monotonic())
 
@@ -430,9 +432,9 @@ class Vehicle:
         """End the stream of setpoints and hold; the last one stays valid for `remain_ms`."""
         with self.lock:
             if self.state not in (State.ARMED, State.FLYING):
-                return f"{self.name} is {self.standing}"
+                return f"{self.name} is {self.state_text}"
             if self.state == State.FLYING:
-                self.hold("the stream of commands was declared over")  # tells the firmware, too
+                self.hold_place("the stream of commands was declared over")  # tells the firmware, too
             else:
                 self.controls.streaming = False
                 self.controls.delivery.cancel()
@@ -440,13 +442,13 @@ class Vehicle:
             return ""
 
     # -- called regularly -------------------------------------------------------------------------------------------
-    def lose(self, reason: str, now: float) -> None:
+    def declare_lost(self, reason: str, now: float) -> None:
         """It is silent. Nothing may be heard, but a landing is ordered all the same, unless it is known to land."""
         with self.lock:
             was_in_air = self.state in IN_AIR
             self.machine.silent(reason)
             if not was_in_air:
-                self.controls.delivery.cancel()  # a take-off that comes late takes nobody by surprise
+                self.controls.delivery.cancel()  # a take-off that comes late would surprise
             elif self.link.connected and not self.controls.delivery.landing:
                 self.land(reason)
                 self.controls.repeat_landing(now)
@@ -456,19 +458,18 @@ class Vehicle:
         with self.lock:
             if self.controls.paused and self.tracker is not None:
                 self.controls.paused = self.tracker.age(now) > self.station.safety.position_age_s
-            if self.controls.blind:
-                self.controls.go_on_blindly(self.state in IN_AIR, self._seen(now), now)
-            elif self.last is not None:
+            blind = self.controls.continue_blind_flight(self.state in IN_AIR, self._measured_place(now), now)
+            if not blind and self.last is not None:
                 self.controls.slow_down(self._speed, now)
             if self.state not in OFF:
                 self.link.order_log(now)
             if self.state in WATCHED_OVER and (order := self.controls.delivery.due(now)) is not None:
                 self.link.order(order)
 
-    def keep_alive(self, now: float, watchdog: bool) -> None:
+    def feed_watchdog(self, now: float, watchdog: bool) -> None:
         """What has to be sent regularly: the emergency stop watchdog, and blind landings."""
         with self.lock:
-            self.controls.land_again(self._height, now)
+            self.controls.repeat_due_landing(self._height, now)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.
             self.guarded |= watchdog and self.state in WATCHED_OVER
             self.link.guarded = self.guarded
@@ -476,7 +477,7 @@ class Vehicle:
                 self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
 
 
-def position_order(tracker: Tracker) -> Send:
+def position_order(tracker: PoseTracker) -> Send:
     """Tell a Crazyflie the last pose that is believed."""
     seen = tracker.last
     assert seen is not None
@@ -486,6 +487,6 @@ def position_order(tracker: Tracker) -> Send:
             cf.loc.send_extpose(seen.position, seen.orientation)
         else:
             cf.loc.send_extpos(seen.position)
-        tracker.was_sent(seen, time.time())
+        tracker.count_sent(seen, time.time())
 
     return send

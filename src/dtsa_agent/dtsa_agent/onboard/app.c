@@ -2,7 +2,7 @@
  *
  * How it is built and flown: docs/how-to/on-board.md. It was never flown on hardware.
  *
- * The ground sets the parameters dtsa.*, says by the app channel where everybody starts and goes,
+ * The ground sets the parameters dtsa.*, sends by the app channel where each agent starts and goes,
  * starts the agent, takes off by the high-level commander, and then sets dtsa.enable. */
 #include <math.h>
 #include <stdbool.h>
@@ -213,8 +213,8 @@ static const char *start(void)
     return begin(awaitsBegin ? DTSA_POLICY_TDMA : policy, 0);
 }
 
-/* All have a common time: in slot beginSlot they begin with slot 0 and the policy that nobody can
- * join. Who comes later stays out: its slots are of another time. */
+/* All have a common time: in slot beginSlot they begin with slot 0 and the policy that no agent can
+ * join. An agent that comes later stays out: its slots are of another time. */
 static void begin_together(void)
 {
     if (!awaitsBegin || status.state == DTSA_LISTENING || status.slot + 1 < (int64_t)beginSlot)
@@ -433,7 +433,7 @@ static void steer(const double position[3], const double place[3], int64_t now, 
         if (before == SAFETY_OFF) crtpCommanderHighLevelDisable(); /* it takes over */
         if (next != before)
             for (int i = 0; i < 3; i++) hold[i] = (float)position[i];
-        /* The others count on it to give way as they do: one whose news of somebody is old still does. */
+        /* The others count on it to give way as they do: an agent whose state of another one is old still does. */
         const int gives_way = next == SAFETY_HOVER && guard.reason == SAFETY_OLD_NEWS;
         const double there[3] = {(double)hold[0], (double)hold[1],
                                  (double)hold[2] - (double)height}; /* frame map */

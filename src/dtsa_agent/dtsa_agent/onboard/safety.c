@@ -58,7 +58,7 @@ safety_mode safety_step(safety *s, const safety_settings *c, const safety_view *
         return s->mode;
     }
     if (s->mode == SAFETY_LAND) return s->mode;
-    if (s->mode == SAFETY_OFF) { /* nobody takes over a vehicle that would have to land at once */
+    if (s->mode == SAFETY_OFF) { /* no take-over of a vehicle that would have to land at once */
         if (!why_land && !why_hover && s->well_s >= c->well_s)
             enter(s, SAFETY_FLY, SAFETY_WELL);
         else

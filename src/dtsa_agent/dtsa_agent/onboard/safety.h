@@ -23,14 +23,14 @@ typedef enum safety_reason {
     SAFETY_BATTERY,
     SAFETY_OUTSIDE,  /* of its box, or it does not know where it is */
     SAFETY_UNHEARD,  /* no frame for too long */
-    SAFETY_OLD_NEWS, /* news of somebody is too old */
+    SAFETY_OLD_NEWS, /* the state of some agent is too old */
     SAFETY_NEWCOMER, /* the others do not know it yet */
     SAFETY_REASONS
 } safety_reason;
 
 typedef struct safety_settings {
-    float news_s;          /* oldest news of one that moves with which it flies */
-    float rests_s;         /* ... of one that has said that it rests: it speaks seldom */
+    float news_s;          /* oldest state of a moving agent with which it flies */
+    float rests_s;         /* ... of an agent that hovers, and sends seldom */
     float unheard_s;       /* without any frame it hovers after this time */
     float land_s;          /* it has hovered for so long: it lands */
     float well_s;          /* all has to be well for so long before it flies again */
@@ -45,8 +45,7 @@ typedef struct safety_view {
     int can_fly, in_air;  /* says the supervisor */
     int newcomer;
     float battery_v, position[3];
-    float
-        oldest_s; /* age of the oldest news of those that move; negative: of somebody there is none */
+    float oldest_s;  /* age of the oldest state of those that move; negative: one is missing */
     float rests_s;   /* ... of those that rest */
     float unheard_s; /* since any frame was heard; negative: never */
 } safety_view;

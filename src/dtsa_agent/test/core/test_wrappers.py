@@ -56,11 +56,11 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
         for swarm in (plain, outside):
             swarm.position[:, still] = plain.scenario.start[:, still] + 0.1
             swarm.begin(slot)
-        vehicles.place(plain.position)
+        vehicles.set_positions(plain.position)
         outside.velocity[:] = plain.velocity
         before = outside.position.copy()
         plain.steer(slot, 0)
-        vehicles.fly(slot)
+        vehicles.send_commands(slot)
         assert np.array_equal(outside.position, before)
         assert np.array_equal(outside.track[-1], before)
         assert len(sent) == slot // 2 + 1
@@ -72,6 +72,22 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
                 swarm.hear(slot, swarm.frame(index))
             swarm.end(slot)
         plain.move(0)
+
+
+def test_no_command_leads_out_of_the_fence() -> None:
+    """Making way for others led one of twelve out, and the bridge landed all."""
+    config, sent = SwarmConfig(agents=2, moving=2, policy="tdma", seed=2), list[np.ndarray]()
+    for fence in (None, ((-0.5, -9.0, -9.0), (0.5, 9.0, 9.0))):
+        swarm = Swarm(config)
+        swarm.scenario.advance(0, swarm)
+        vehicles = ExternalVehicles([swarm], 1, lambda _, command: sent.append(command.copy()), fence)
+        vehicles.set_positions(np.array([[0.45, -0.6], [0.0, 0.0], [0.0, 0.0]]))
+        swarm.goal[:] = [[3.0, -3.0], [0.0, 0.0], [0.0, 0.0]]
+        swarm.begin(0)
+        vehicles.send_commands(0)
+    free, fenced = sent
+    assert free[0, 0] > 0.5 > 0.1 > fenced[0, 0] > 0.0  # slower, the nearer the fence
+    assert free[0, 1] < -0.5 < 0.1 < fenced[0, 1]  # outside: back
 
 
 def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple[float, float, float]:
@@ -89,7 +105,7 @@ def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple
     swarm.scenario.advance(0, swarm)
     place, velocity, closest = swarm.scenario.start.copy(), np.zeros((3, 12)), np.inf
     for now in range(slot + 200):
-        vehicles.place(place)
+        vehicles.set_positions(place)
         swarm.velocity[:] = velocity
         if now == slot and stop_here:
             vehicles.stop_here()
@@ -97,7 +113,7 @@ def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple
         for index in np.flatnonzero(swarm.sends):
             swarm.hear(now, swarm.frame(index))
         if now < slot or stop_here:
-            vehicles.fly(now)
+            vehicles.send_commands(now)
         elif now >= slot + 20:
             commands[:] = 0.0
         swarm.end(now)

@@ -22,7 +22,7 @@ from waiting import wait_for
 
 from dtsa_agent.crazyflie.node.parameters import read_parameters
 from dtsa_agent.crazyflie.state import State
-from dtsa_agent.crazyflie.vehicle import Vehicle
+from dtsa_agent.crazyflie.vehicle import CrazyflieVehicle
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
@@ -135,7 +135,7 @@ def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> 
         assert pilot.state(3) is State.FLYING
         pilot.logged("cf1: distance: 0.3. m from cf2")
         assert not fleet.events(name="collision")
-        pilot.bridge.heartbeat()
+        pilot.bridge.note_heartbeat()
         silent = time.monotonic()
         time.sleep(0.7)
         assert pilot.state(3) is State.FLYING
@@ -176,15 +176,15 @@ def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path) -> N
         with flight(data) as pilot:
             assert sorted(pilot.bridge.connect()) == ["cf1", "cf2"]
             assert pilot.bridge.connected == 2
-            pilot.bridge.each(["cf3", "cf4"], lambda v: v.arm(True))
+            pilot.bridge.order_each(["cf3", "cf4"], lambda v: v.arm(True))
             wait_for(lambda: pilot.state(4) is State.ARMED)
             pilot.bridge.land_all("armed, but still on the ground: there is nothing to land")
             wait_for(lambda: pilot.state(4) is State.READY)
             wait_for(lambda: fleet.events(4, "state")[-1]["state"] == "pre-flight checks passed")
             assert not fleet.events(4, "land")
-            pilot.bridge.each(["cf4"], lambda v: v.arm(True))
+            pilot.bridge.order_each(["cf4"], lambda v: v.arm(True))
             wait_for(lambda: pilot.state(4) is State.ARMED)
-            done, why = pilot.bridge.each(pilot.bridge.vehicles, lambda v: v.takeoff(0.5, 1.0))
+            done, why = pilot.bridge.order_each(pilot.bridge.vehicles, lambda v: v.takeoff(0.5, 1.0))
             assert (done, "cf3 is ready, not armed" in why) == (False, True)
             wait_for(lambda: pilot.state(4) is State.FLYING)
             assert fleet.events(3, "arming refused")
@@ -226,7 +226,7 @@ def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_contro
         wait_for(lambda: link.received > forgotten + 20)
 
 
-def check_parameters(one: Vehicle, two: Vehicle) -> None:
+def check_parameters(one: CrazyflieVehicle, two: CrazyflieVehicle) -> None:
     known = read_parameters(one.link)
     assert (known["ring.effect"].value, known["hlCommander.vland"].value) == (6, 0.5)
     for name, value, problem in (

@@ -37,10 +37,10 @@ PATIENT = {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}}  # not what is 
 
 
 @contextmanager
-def swarm(tmp_path: Path) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Graph]]:
+def swarm(tmp_path: Path, **station: float) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Graph]]:
     with ros_domain() as domain, fake_fleet(tmp_path, COUNT, "--arming", "mixed") as fleet:
         config = tmp_path / "swarm.yaml"
-        data = settings(fleet, PATIENT)
+        data = settings(fleet, PATIENT | station)
         data["robots"]["cf3"]["group_mask"] = 2
         config.write_text(yaml.safe_dump(data))
         with bridge_process(domain, config) as process, closing(Graph(domain)) as graph:
@@ -78,17 +78,18 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         wait_for(lambda: graph.place(1) == pytest.approx((x - 0.3, 0.2, 1.05), abs=0.05))
         # Streamed commands, with yaw: cf2 by velocity, cf1 by position.
         y = graph.place(2)[1]
-        for _ in range(50):
+
+        def followed() -> bool:
             message = VelocityWorld(yaw_rate=57.3)
             message.vel.y = -0.4
             graph.velocity[2].publish(message)
-            place = Position(x=x - 0.3, y=0.0, z=0.95, yaw=57.3)
-            graph.position.publish(place)
-            time.sleep(0.02)
-        assert graph.place(2)[1] < y - 0.2
-        turned = graph.last["/cf2/odom"].pose.pose.orientation
-        assert turned.z > 0.2  # counter-clockwise
-        assert graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.95), abs=0.15)
+            graph.position.publish(Position(x=x - 0.3, y=0.0, z=0.95, yaw=57.3))
+            time.sleep(0.01)
+            turned = graph.last["/cf2/odom"].pose.pose.orientation.z > 0.2  # counter-clockwise
+            there = graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.95), abs=0.15)
+            return bool(graph.place(2)[1] < y - 0.2 and turned and there)
+
+        wait_for(followed)
         status = graph.last["/cf2/status"]
         assert status.supervisor_info & Status.SUPERVISOR_INFO_IS_FLYING
         assert 3.0 < status.battery_voltage < 4.2
@@ -100,10 +101,10 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         here = Point(x=graph.place(3)[0], y=graph.place(3)[1], z=1.05)
         answer = graph.call(GoTo, "/all/go_to", group_mask=4, goal=here, duration=Duration(sec=1))
         assert (answer.success, answer.message) == (False, "nobody of cf1, cf2, cf3 is in a group of 4")
-        before = len(fleet.events(1, "go_to")), len(fleet.events(3, "go_to"))
         assert graph.call(GoTo, "/all/go_to", group_mask=2, goal=here, duration=Duration(sec=1)).success
-        wait_for(lambda: len(fleet.events(3, "go_to")) > before[1])
-        assert len(fleet.events(1, "go_to")) == before[0]
+        goal = pytest.approx([here.x, here.y, here.z], abs=0.002)
+        wait_for(lambda: any(event["goal"] == goal for event in fleet.events(3, "go_to")))
+        assert not any(event["goal"] == goal for event in fleet.events(1, "go_to"))  # it may hold its place meanwhile
         # Goals, heights and commands outside the fence, or faster than anybody means, are refused in so many words.
         answer = graph.call(GoTo, "/cf3/go_to", goal=Point(x=1.95, z=0.95), duration=Duration(sec=5))
         assert "cf3: the goal (1.95, 0.00, 0.00) is 0.45 m outside the geofence in x" in answer.message
@@ -142,10 +143,10 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("state", "code"), [(State.READY, 0), (State.LOST, 1)])
 def test_one_that_is_lost_on_the_way_down_is_named_at_the_end(state: State, code: int) -> None:
     bridge, said = MagicMock(), []
-    bridge.in_air.return_value = ["cf1", "cf2"]
+    bridge.names_in_air.return_value = ["cf1", "cf2"]
     bridge.wait_landed.return_value = []
     bridge.vehicles = {"cf1": SimpleNamespace(state=State.READY), "cf2": SimpleNamespace(state=state)}
-    node = SimpleNamespace(bridge=bridge, say=lambda level, line: said.append(line))
+    node = SimpleNamespace(bridge=bridge, log=lambda level, line: said.append(line))
     assert bridge_node._end(node, SimpleNamespace(count=1)) == code  # type: ignore[arg-type]
     assert ("not known to have landed: cf2" in said) == bool(code)
     bridge.close.assert_called_once_with()
@@ -153,7 +154,8 @@ def test_one_that_is_lost_on_the_way_down_is_named_at_the_end(state: State, code
 
 @pytest.mark.realtime
 def test_second_ctrl_c_is_the_emergency_stop(tmp_path: Path) -> None:
-    with swarm(tmp_path) as (fleet, process, graph):
+    slowly = 0.05  # m/s: the second signal comes before they stand, on a busy machine, too
+    with swarm(tmp_path, land_speed_mps=slowly) as (fleet, process, graph):
         up(graph)
         process.send_signal(signal.SIGINT)
         wait_for(lambda: len(fleet.events(name="land")) == COUNT)

@@ -32,10 +32,7 @@ def radio_flight(
     every = count + strangers
     data = {
         "robots": {
-            f"cf{k}": {
-                "uri": f"radio://{radio}/80/2M/E7E7E7E7{k:02X}",
-                "initial_position": [0.35 * k - 1.25, 0.0, 0.0],
-            }
+            f"cf{k}": {"uri": f"radio://{radio}/80/2M/E7E7E7E7{k:02X}", "initial_position": [0.35 * k - 1.25, 0.0, 0.0]}
             for k in range(1, every + 1)
         },
         "all": {"connect_timeout_s": 10.0, "estimator_timeout_s": 5.0},
@@ -58,9 +55,9 @@ def radio_flight(
 def test_a_dongle_that_is_pulled_is_named_and_its_links_go_on_when_it_is_back(tmp_path: Path) -> None:
     with radio_flight(tmp_path, 2, {"safety": {"emergency_watchdog": False}}) as (fleet, pilot):
         one = pilot.bridge.vehicles["cf1"]
-        pilot.bridge.each(["cf1", "cf2"], lambda v: v.arm(True))
+        pilot.bridge.order_each(["cf1", "cf2"], lambda v: v.arm(True))
         wait_for(lambda: pilot.state(1) == pilot.state(2) == State.ARMED)
-        assert pilot.bridge.each(["cf1"], lambda v: v.takeoff(0.95, 2.0)) == (True, "")
+        assert pilot.bridge.order_each(["cf1"], lambda v: v.takeoff(0.95, 2.0)) == (True, "")
         time.sleep(2.5)
         pulled = time.monotonic()
         fleet.fault("unplug", 1, dongle=0, seconds=5.0)
@@ -120,7 +117,7 @@ def test_who_else_sends_on_the_channel_is_warned_of(tmp_path: Path) -> None:
 def test_an_emergency_stop_reaches_all_that_listen(tmp_path: Path) -> None:
     """Also those whose acknowledgements are missing, and one that this bridge has never met."""
     with radio_flight(tmp_path, 3, {}, strangers=1) as (fleet, pilot):
-        pilot.bridge.each(["cf1", "cf2", "cf3"], lambda v: v.arm(True))
+        pilot.bridge.order_each(["cf1", "cf2", "cf3"], lambda v: v.arm(True))
         assert pilot.logged("radio 1 is kept for emergency stops")
         fleet.fault("drop", 2, rate=1.0, direction="down")
         fleet.fault("drop", 3, rate=0.9, direction="up")

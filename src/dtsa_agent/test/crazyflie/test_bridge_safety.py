@@ -23,10 +23,10 @@ from dtsa_agent.crazyflie.safety import (
     Action,
     SafetyMonitor,
     SafetySettings,
-    Watched,
+    WatchedVehicle,
     outside_fence,
 )
-from dtsa_agent.crazyflie.settings import StationSettings
+from dtsa_agent.crazyflie.settings import GroundStationSettings
 from dtsa_agent.crazyflie.state import State, StateMachine
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ PARAMETER, LOG = b"\x2e\x01", b"\x5d\x05"
 
 
 def taken(box: Mailbox) -> list[bytes]:
-    return [found[1] for found in iter(box.take, None)]
+    return [waiting[1] for waiting in iter(box.pop, None)]
 
 
 def mailbox(*packets: bytes) -> Mailbox:
@@ -128,14 +128,13 @@ def mailbox(*packets: bytes) -> Mailbox:
 
     box = Mailbox()
     for packet in packets:
-        box.put(packet)
+        box.add(packet)
     return box
 
 
 def test_only_the_latest_command_is_sent_orders_go_first_and_the_others_take_turns() -> None:
     box = mailbox(PARAMETER, SETPOINT + b"1", POSITION, SETPOINT + b"2", WATCHDOG, LOG)
     assert taken(box) == [WATCHDOG, SETPOINT + b"2", PARAMETER, POSITION, LOG]
-    assert box.replaced == 1
     assert taken(mailbox(SETPOINT, WATCHDOG, WATCHDOG)) == [WATCHDOG, SETPOINT]
 
 
@@ -146,7 +145,7 @@ def test_an_order_ends_the_stream_and_an_emergency_stop_empties_the_box() -> Non
 
 def test_an_order_that_has_waited_for_long_takes_nobody_by_surprise(monkeypatch: pytest.MonkeyPatch) -> None:
     box = mailbox(GO_TO, STOP)
-    box.put(LAND_ORDER)
+    box.add(LAND_ORDER)
     old = mailbox(SETPOINT, POSITION, PARAMETER)
     later = time.monotonic() + 1.1
     monkeypatch.setattr(time, "monotonic", lambda: later)
@@ -156,15 +155,17 @@ def test_an_order_that_has_waited_for_long_takes_nobody_by_surprise(monkeypatch:
     assert 0 < len(taken(flood)) < 50
 
 
-def vehicle(name: str = "cf1", **changes: Any) -> Watched:
+def vehicle(name: str = "cf1", **changes: Any) -> WatchedVehicle:
     values: dict[str, Any] = {
         "name": name, "state": State.FLYING, "position": (0.0, 0.0, 0.0), "battery": 3.9, "battery_warning": 3.4,
         "battery_critical": 3.2, "log_age": 0.02, "command_age": 0.02,
     }  # fmt: skip
-    return Watched(**(values | changes))
+    return WatchedVehicle(**(values | changes))
 
 
-def verdicts(*vehicles: Watched, heartbeat: float | None = None, now: float = 0.0, **settings: Any) -> list[tuple]:
+def verdicts(
+    *vehicles: WatchedVehicle, heartbeat: float | None = None, now: float = 0.0, **settings: Any
+) -> list[tuple]:
     monitor = SafetyMonitor(SafetySettings(**settings))
     return [(v.name, v.action, v.rule) for v in monitor.check(now, vehicles, heartbeat)]
 
@@ -261,7 +262,7 @@ def test_a_rule_speaks_again_after_it_had_ceased() -> None:
 
 
 def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused() -> None:
-    station, origin = StationSettings(), (0.0, 0.0, 0.95)
+    station, origin = GroundStationSettings(), (0.0, 0.0, 0.95)
     fence = station.safety
     limits = fence, origin, station.max_stream_mps
     assert outside_fence((1.5, 0.0, 1.0), fence, origin) == ""

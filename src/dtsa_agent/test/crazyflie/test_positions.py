@@ -17,7 +17,7 @@ import yaml
 from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.positions import MOVED_AGAIN, PositionSettings, Settling, Tracker
+from dtsa_agent.crazyflie.positions import MOVED_AGAIN, PoseTracker, PositionSettings, SettlingCheck
 from dtsa_agent.crazyflie.safety import EstimateWatch
 from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_agent.crazyflie.state import VehicleState
@@ -28,11 +28,11 @@ ORIGIN = (0.0, 0.0, 0.95)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
-def tracker(**changes: Any) -> Tracker:
-    return Tracker(PositionSettings(source="pose", **changes), ORIGIN, ROOM)
+def tracker(**changes: Any) -> PoseTracker:
+    return PoseTracker(PositionSettings(source="pose", **changes), ORIGIN, ROOM)
 
 
-def offer(t: Tracker, place: Any, at: float, *, q: Any = LEVEL, frame: str = "world", flying: bool = False) -> str:
+def offer(t: PoseTracker, place: Any, at: float, *, q: Any = LEVEL, frame: str = "world", flying: bool = False) -> str:
     return t.offer(place, q, frame, 1000.0 + at, at, flying=flying)
 
 
@@ -106,7 +106,7 @@ def test_latency_and_rate() -> None:
     for k in range(150):
         offer(t, (0.0, 0.0, 0.0), 1.0 + 0.01 * k)
         assert t.last is not None
-        t.was_sent(t.last, 1000.0 + 1.0 + 0.01 * k + 0.004)
+        t.count_sent(t.last, 1000.0 + 1.0 + 0.01 * k + 0.004)
     assert t.rate(2.495) == pytest.approx(100, abs=1)
     assert (t.latency(0.5), t.latency(0.99)) == (pytest.approx(0.004), pytest.approx(0.004))
     assert (t.sent, t.age(2.495)) == (150, pytest.approx(0.005))
@@ -168,7 +168,7 @@ def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None
     ((0.0, 0.0, 0.0), 1e-5, None, ""),
 ])  # fmt: skip
 def test_settled_is_where_it_stands(place: Any, variance: float, seen: Any, words: str) -> None:
-    settling = Settling(0.01, ORIGIN, ROOM, None if seen is None else 0.1)
+    settling = SettlingCheck(0.01, ORIGIN, ROOM, None if seen is None else 0.1)
     settling.restart()
     for _ in range(10):
         settled = settling.sample(place, (variance,) * 3, None if seen == "not" else seen)
@@ -177,7 +177,7 @@ def test_settled_is_where_it_stands(place: Any, variance: float, seen: Any, word
 
 
 def test_an_estimate_that_wanders_has_not_settled() -> None:
-    settling = Settling(0.01, ORIGIN, ROOM, None)
+    settling = SettlingCheck(0.01, ORIGIN, ROOM, None)
     assert not any(settling.sample((0.03 * k, 0.0, 0.0), (1e-5,) * 3, None) for k in range(20))
     assert "its place moves by" in settling.problem
 
@@ -225,7 +225,7 @@ def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.Monkey
     pose = SimpleNamespace(position=position, orientation=orientation)
     poses = [SimpleNamespace(name=name, pose=pose) for name in ("wand", "cf2")]
     message = SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id="world"), poses=poses)
-    _named({"cf2": SimpleNamespace(see=lambda *pose: got.append(pose))}, message, None)  # type: ignore[dict-item]
+    _named({"cf2": SimpleNamespace(receive_pose=lambda *pose: got.append(pose))}, message, None)  # type: ignore[dict-item]
     assert got == [((1.0, 2.0, 3.0), LEVEL, "world", 5.5)]
 
 

@@ -244,13 +244,13 @@ def _swarm(options: dict[str, str], settings: Any) -> SwarmConfig:
     """Settings of the swarm that flies the protocol."""
     from dtsa_agent.core import SwarmConfig
     from dtsa_agent.core.settings.declaration import settings_of
-    from dtsa_agent.crazyflie.onboard import check_on_board, key_of
+    from dtsa_agent.crazyflie.onboard import check_onboard_swarm, key_of
 
     specs = {spec.name: spec for spec in settings_of(SwarmConfig)}
     values = {"policy": "lease", **{name: specs[name].parse(text) for name, text in options.items()}}
     values |= {"agents": settings.agents, "seed": settings.seed, "auth": "auth_session" in options}
     swarm = SwarmConfig.from_dict(values)
-    check_on_board(swarm)
+    check_onboard_swarm(swarm)
     key_of(swarm)
     return swarm
 

@@ -37,6 +37,7 @@ from waiting import wait_for
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_agent.crazyflie.node.interfaces import STATE
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import mission_problem
@@ -119,7 +120,7 @@ def test_two_as_near_as_in_a_crash_or_somebody_who_may_still_fly_fail_a_mission(
     swarm = SwarmConfig(agents=3)
     run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
     metrics, ended = FlightMetrics(run, make_scenario(swarm)), StopToken(Stop())
-    mission: Any = SimpleNamespace(ended=ended, bridge_alive=lambda: None)
+    mission: Any = SimpleNamespace(ended=ended, check_bridge_process=lambda: None)
     watch, status = MissionWatch(mission, MagicMock(), metrics), ChannelStatus(0, {}, [])
     watch.idle(status)
     assert not ended.reason
@@ -144,13 +145,25 @@ def check_records(out: Path) -> None:
         counts = {name: topic.msgcount for name, topic in bag.topics.items()}
     assert set(counts) >= {"/all/events", "/diagnostics"}
     for cf in range(1, COUNT + 1):
-        assert counts[f"/cf{cf}/status"] > 20
+        assert counts[f"/cf{cf}/{STATE}"] > 20
         assert counts[f"/cf{cf}/odom"] > 50
         assert counts[f"/cf{cf}/cmd_velocity_world"] > 20
     assert counts["/all/events"] >= len(texts) > 20
     data = run_data(out)
     assert data["mission"]["vehicles"][0][0] == "cf1"
     assert any("order /all/takeoff" in text for _, _, text in data["mission"]["events"])
+
+
+def check_priorities(mission: int) -> None:
+    """Nothing keeps the bridge waiting: it runs before the agents, and not on their processor."""
+    children = {Path(f"/proc/{child}/cmdline").read_bytes(): child for child in children_of(mission)}
+    nodes = b"bridge_node", b"agents_node"
+    bridge, agents = (next(child for line, child in children.items() if name in line) for name in nodes)
+    real_time = os.sched_getscheduler(bridge) == os.SCHED_RR
+    if real_time:  # where the machine allows it
+        assert os.sched_getparam(bridge).sched_priority > os.sched_getparam(agents).sched_priority > 0
+        if len(os.sched_getaffinity(0)) > 1:
+            assert not os.sched_getaffinity(bridge) & os.sched_getaffinity(agents)
 
 
 async def told_in_flight(url: str) -> set[str]:
@@ -265,6 +278,7 @@ def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         with mission("--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out")) as process:
             wait_for(lambda: streaming(fleet), 60)
+            check_priorities(process.pid)
             time.sleep(1.0)
             fleet.fault("freeze", 2)
             _, errors = process.communicate(timeout=60)

@@ -166,12 +166,12 @@ void appMain(void) { vTaskDelay(M2T(20000)); DEBUG_PRINT("%u\\n", (unsigned)usec
 
 def test_parameters_and_log_variables_have_names(write) -> None:
     place = write("""
-static uint8_t mode; static float gain = 0.5f; static int32_t seen; static int told;
-static void changed(void) { told++; }
+static uint8_t mode; static float gain = 0.5f; static int32_t seen; static int report;
+static void changed(void) { report++; }
 static float twice(uint32_t time, void *data) { (void)time; (void)data; return 2.0f * gain; }
 static logByFunction_t doubled = {.aquireFloat = twice};
 void appMain(void) {
-    for (;;) { seen = paramGetInt(paramGetVarId("own", "mode")) * 10 + told; vTaskDelay(1); }
+    for (;;) { seen = paramGetInt(paramGetVarId("own", "mode")) * 10 + report; vTaskDelay(1); }
 }
 PARAM_GROUP_START(own)
 PARAM_ADD_WITH_CALLBACK(PARAM_UINT8, mode, &mode, changed)
@@ -281,7 +281,7 @@ def test_the_ground_gives_orders_at_instants(write) -> None:
         lab.at(2.0, lambda: lab.switch_off(1))
         lab.run(1.9)
         assert [lab.parameter(agent, "own.go") for agent in (1, 2)] == [1, 1]
-        assert (lab.world.vehicles.position[2] > 0.8).all()
+        assert (lab.motion.vehicles.position[2] > 0.8).all()
         lab.run(3.0)
         assert lab.parameter(2, "own.go") == 7
         assert lab.summary()["crashed"] == [1]  # it fell: its power was off

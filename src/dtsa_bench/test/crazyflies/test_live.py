@@ -17,7 +17,7 @@ from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_bench.crazyflies.peer_lab import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
-from dtsa_bench.crazyflies.simulated.radio import esb
+from dtsa_bench.crazyflies.simulated.radio.air import BROADCAST
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 
@@ -52,7 +52,7 @@ def live(tmp_path: Path) -> Iterator[LiveLaboratory]:
 
 
 def sniff(live: LiveLaboratory) -> list[bytes]:
-    dongle, heard = live.side.dongles[0], []
+    dongle, heard = live.server.dongles[0], []
 
     def give(transfer: bytes) -> None:
         heard.append(transfer[7:])
@@ -60,7 +60,7 @@ def sniff(live: LiveLaboratory) -> list[bytes]:
 
     dongle.request(requests.SET_CHANNEL, 80, 0, b"", 0)
     dongle.request(requests.SET_RATE, 2, 0, b"", 0)
-    dongle.request(requests.SET_SNIFFER_ADDRESS, 0, 0, esb.BROADCAST, 0)
+    dongle.request(requests.SET_SNIFFER_ADDRESS, 0, 0, BROADCAST, 0)
     dongle.request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
     dongle.sniffer.give = give
     dongle.sniffer.read()
@@ -72,7 +72,7 @@ def test_a_dongle_in_sniffer_mode_hears_apps_and_they_hear_it(live: LiveLaborato
     live.run(0.5)
     assert {packet[:3] for packet in heard} == {b"\xff\x85\x01", b"\xff\x85\x02"}
     assert all(len(packet) == 6 for packet in heard)
-    live.side.dongles[0].transfer(esb.BROADCAST + b"\xff\x83hello", live.now_ns, lambda data: None)
+    live.server.dongles[0].transfer(BROADCAST + b"\xff\x83hello", live.now_ns, lambda data: None)
     live.run(0.6)
     assert {live.log(agent, "own.heard") for agent in (1, 2)} == {5.0}
 

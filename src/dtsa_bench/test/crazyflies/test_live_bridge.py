@@ -43,6 +43,7 @@ SEALED = {**SWARM, "auth": True, "auth_session": 41}
 KEY = {VARIABLE: "9f86d081884c7d659a2feaa0c55ad015"}
 CONFIG = SwarmConfig.from_dict({**SEALED, "agents": len(NAMES)})
 FLOOR_M = 0.6  # below the frame map
+TAKEOFF_S = 5.0  # long enough to ask meanwhile, on a busy machine
 URI = "radio://{}/80/2M"
 DTSA = [sys.executable, "-m", "dtsa_bench"]
 
@@ -65,9 +66,9 @@ def swarm_yaml(folder: Path) -> Path:
 
 def steer(operator: Operator) -> None:
     """All take off, and their agents steer as soon as the take-off is over; before that the bridge refuses."""
-    operator.take_off(FLOOR_M, 1.2)
     client = operator.graph.node.create_client(SetBool, "/all/enable")
     operator.graph.until(client.service_is_ready)
+    operator.take_off(FLOOR_M, TAKEOFF_S)
     assert "still flies its take-off" in operator.graph.ask(client, SetBool.Request(data=True)).message
     operator.graph.until(lambda: operator.graph.ask(client, SetBool.Request(data=True)).success)
 

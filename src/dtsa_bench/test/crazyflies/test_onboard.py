@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.commands.cli import main
 from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import FIRMWARE, compiler
-from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
+from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnboardSwarm
 from dtsa_bench.log.agent_bag import read
 from dtsa_bench.log.merge.merge import Merge, is_verified
 
@@ -37,7 +37,7 @@ def merged(folder: Path) -> dict[str, Any]:
     (SwarmConfig(agents=5, policy="lease", auth=True, auth_session=3), LabSettings()),
 ])  # fmt: skip
 def test_apps_decide_what_agents_on_computers_decide(swarm: SwarmConfig, lab: LabSettings, tmp_path: Path) -> None:
-    with OnBoard(swarm, lab, tmp_path, key=bytes(range(16)) if swarm.auth else b"", enable_s=6.0) as flight:
+    with OnboardSwarm(swarm, lab, tmp_path, key=bytes(range(16)) if swarm.auth else b"", enable_s=6.0) as flight:
         assert flight.lab.warnings == ""
         flight.lab.run(11.5)
         summary = flight.finish()
@@ -57,7 +57,7 @@ def test_a_policy_that_nobody_can_join_begins_with_all_together(loss: float, tmp
     """DTSA: with losses tables come apart, several send at once, and agents that hear too little hover."""
     flown, whole = tmp_path / "flown", tmp_path / "merged"
     flown.mkdir()
-    with OnBoard(SwarmConfig(agents=6, policy="dtsa"), LabSettings(loss=loss), flown, enable_s=6.0) as flight:
+    with OnboardSwarm(SwarmConfig(agents=6, policy="dtsa"), LabSettings(loss=loss), flown, enable_s=6.0) as flight:
         flight.lab.run(11.5)
         summary = flight.finish()
     assert summary["crashed"] == []
@@ -74,14 +74,14 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     digests = []
     for seed in (1, 1, 2):
         lab = LabSettings(seed=seed, loss=0.2, drift_ppm=50.0, polls=20.0)
-        with OnBoard(SwarmConfig(agents=3, policy="lease"), lab) as flight:
+        with OnboardSwarm(SwarmConfig(agents=3, policy="lease"), lab) as flight:
             flight.lab.run(9.0)
             digests.append(flight.finish()["digest"])
     assert digests[0] == digests[1] != digests[2]
 
 
 def test_one_is_switched_off_and_on_again_and_the_others_fly_on(tmp_path: Path) -> None:
-    with OnBoard(LEASE, LabSettings(), tmp_path) as flight:
+    with OnboardSwarm(LEASE, LabSettings(), tmp_path) as flight:
         lab = flight.lab
         lab.at(10.0, lambda: lab.switch_off(4))
         lab.at(10.5, lambda: lab.switch_on(4))
@@ -96,7 +96,7 @@ def test_one_is_switched_off_and_on_again_and_the_others_fly_on(tmp_path: Path) 
 @pytest.mark.parametrize("known", [False, True])
 def test_an_agent_with_a_new_goal_is_soon_heard(known: bool, tmp_path: Path) -> None:
     """Agents whose goal is their last give nearly all of their turns away, for good: such an agent may get no other."""
-    with OnBoard(replace(LEASE, targets_known=known), LabSettings(), tmp_path, enable_s=6.0) as flight:
+    with OnboardSwarm(replace(LEASE, targets_known=known), LabSettings(), tmp_path, enable_s=6.0) as flight:
         lab = flight.lab
         lab.run(13.0)
         before = [lab.log(k, "dtsa.sent") for k in range(1, 6)]
@@ -111,14 +111,14 @@ def test_an_agent_with_a_new_goal_is_soon_heard(known: bool, tmp_path: Path) -> 
     assert merged(tmp_path)["decisions_again"]["differences"] == []
 
 
-def in_flight(flight: OnBoard) -> None:
+def in_flight(flight: OnboardSwarm) -> None:
     flight.lab.run(9.5)
     agents = flight.swarm.agents
     assert [flight.lab.log(k, "dtsa.mode") for k in range(1, agents + 1)] == [FLY] * agents
 
 
 def test_the_ground_takes_a_vehicle_back_in_four_ways() -> None:
-    with OnBoard(SwarmConfig(agents=4, policy="lease"), LabSettings()) as flight:
+    with OnboardSwarm(SwarmConfig(agents=4, policy="lease"), LabSettings()) as flight:
         in_flight(flight)
         lab = flight.lab
         lab.set_parameter(1, "dtsa.enable", 0)
@@ -130,7 +130,7 @@ def test_the_ground_takes_a_vehicle_back_in_four_ways() -> None:
         assert [lab.log(k, "dtsa.mode") for k in range(1, 4)] == [OFF, OFF, LAND]
         assert [lab.log(k, "dtsa.why") for k in range(1, 4)] == [DISABLED, GROUND, ORDERED]
         lab.run(12.5)
-        height = lab.world.vehicles.position[2]
+        height = lab.motion.vehicles.position[2]
         assert height[3] < 0.05
         lab.run(16.0)
         assert height[0] == pytest.approx(1.2, abs=0.15)  # it holds its place
@@ -140,7 +140,7 @@ def test_the_ground_takes_a_vehicle_back_in_four_ways() -> None:
 
 
 def test_who_hears_nobody_hovers_and_then_lands() -> None:
-    with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings()) as flight:
+    with OnboardSwarm(SwarmConfig(agents=3, policy="lease"), LabSettings()) as flight:
         in_flight(flight)
         lab = flight.lab
         for agent in (2, 3):
@@ -154,7 +154,7 @@ def test_who_hears_nobody_hovers_and_then_lands() -> None:
         assert (lab.log(1, "dtsa.mode"), lab.log(1, "dtsa.why")) == (HOVER, UNHEARD)
         lab.run(18.0)
         assert (lab.log(1, "dtsa.mode"), lab.log(1, "dtsa.why")) in [(LAND, UNHEARD), (OFF, UNHEARD)]
-        assert lab.world.vehicles.position[2, 0] < 0.05
+        assert lab.motion.vehicles.position[2, 0] < 0.05
         assert lab.record.crashed == {}
 
 
@@ -162,8 +162,8 @@ def test_an_agent_that_stays_for_old_news_gives_way_to_those_that_it_hears() -> 
     """To agent 1 all news is too old, where six meet; one that held its place would be passed at 0.22 m."""
     swarm = SwarmConfig(agents=6, policy="lease", axis_x_m=0.8, axis_y_m=0.8, jitter_m=0.0, targets_known=False)
     nearest = []
-    with OnBoard(swarm, LabSettings(), enable_s=6.0) as flight:
-        lab, place = flight.lab, flight.lab.world.vehicles.position
+    with OnboardSwarm(swarm, LabSettings(), enable_s=6.0) as flight:
+        lab, place = flight.lab, flight.lab.motion.vehicles.position
         lab.run(6.9)
         for name in ("dtsa.newsS", "dtsa.restsS"):
             lab.set_parameter(1, name, -1.0)
@@ -182,7 +182,7 @@ def test_an_agent_that_stays_for_old_news_gives_way_to_those_that_it_hears() -> 
 ])  # fmt: skip
 def test_a_swarm_that_cannot_fly_on_board_is_refused(swarm: SwarmConfig, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        OnBoard(swarm, LabSettings())
+        OnboardSwarm(swarm, LabSettings())
 
 
 def test_the_app_compiles_for_its_microcontroller_without_a_warning(tmp_path: Path) -> None:

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field
 import pytest
 
 from dtsa_agent.crazyflie import addresses as budget
+from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
-from dtsa_bench.crazyflies.simulated.radio import esb
-from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir
-from dtsa_bench.crazyflies.simulated.radio.dongle import Dongle
-from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, Receiver
-from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
+from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, BROADCAST, RATE_NAMES, Agenda, RadioAir
+from dtsa_bench.crazyflies.simulated.radio.dongle import DongleModel
+from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, RadioReceiver
 from dtsa_bench.crazyflies.simulated.radio.sniffer_mode import SnifferMode
 
 NULL, SAFELINK = b"\xff", b"\xff\x05\x01"
@@ -21,14 +20,14 @@ US = 1000
 TWO = RadioSettings(dongles=2, request_ms=0.0)
 
 
-def station(number: int, channel: int = 80, rate: str = "2M") -> Station:
-    return Station.of(f"radio://0/{channel}/{rate}/E7E7E7E7{number:02X}")
+def station(number: int, channel: int = 80, rate: str = "2M") -> RadioAddress:
+    return RadioAddress.of(f"radio://0/{channel}/{rate}/E7E7E7E7{number:02X}")
 
 
 @dataclass
 class Room:
     settings: RadioSettings = TWO
-    stations: tuple[Station, ...] = (station(1), station(2))
+    stations: tuple[RadioAddress, ...] = (station(1), station(2))
     heard: list[tuple[int, bytes]] = field(default_factory=list)
     deaf: set[tuple[int, bool]] = field(default_factory=set)  # index, up: what a fault stops
     agenda: Agenda = field(default_factory=Agenda)
@@ -36,23 +35,23 @@ class Room:
     def __post_init__(self) -> None:
         first = self.settings.dongles + 1
         self.receivers = [
-            Receiver(s, lambda packet, t, k=k: self.heard.append((k, packet))) for k, s in enumerate(self.stations)
+            RadioReceiver(s, lambda packet, t, k=k: self.heard.append((k, packet))) for k, s in enumerate(self.stations)
         ]
         by_id = {first + k: receiver for k, receiver in enumerate(self.receivers)}
         air = RadioAir(first - 1 + len(by_id), self.settings.loss, self.settings.seed)
         sniffers: dict[int, SnifferMode] = {}
         self.dongles = [
-            Dongle(k, self.settings, air, self.agenda, by_id, self._hears, sniffers) for k in range(1, first)
+            DongleModel(k, self.settings, air, self.agenda, by_id, self._hears, sniffers) for k in range(1, first)
         ]
 
     def _hears(self, radio: int, up: bool) -> bool:
         return (radio - self.settings.dongles - 1, up) not in self.deaf
 
-    def tune(self, dongle: int, to: Station) -> None:
+    def tune(self, dongle: int, to: RadioAddress) -> None:
         d = self.dongles[dongle]
         d.request(requests.SET_CHANNEL, to.channel, 0, b"", 0)
         d.request(requests.SET_ADDRESS, 0, 0, to.address, 0)
-        d.request(requests.SET_RATE, esb.RATE_NAMES.index(to.rate), 0, b"", 0)
+        d.request(requests.SET_RATE, RATE_NAMES.index(to.rate), 0, b"", 0)
 
     def exchange(self, packet: bytes, at_ns: int = 0, dongle: int = 0) -> list[tuple[int, bytes]]:
         """When the answer to a packet came (ns), and the answer."""
@@ -127,7 +126,7 @@ def test_two_dongles_on_one_channel_collide_and_on_two_channels_do_not() -> None
 
 def test_a_broadcast_reaches_all_on_its_channel_and_is_not_answered() -> None:
     room = Room(stations=(station(1), station(2), station(3, 60), station(4, 80, "1M")))
-    room.tune(0, Station("", 80, "2M", esb.BROADCAST))
+    room.tune(0, RadioAddress("", 80, "2M", BROADCAST))
     room.dongles[0].request(requests.ACK_ENABLE, 0, 0, b"", 0)
     assert room.exchange(PACKET) == []
     assert room.exchange(PACKET[:16] * 2 + bytes(10)) == [], "more than 32 bytes: two packets"
@@ -146,7 +145,7 @@ def test_losses_come_from_the_seed_and_are_as_many_as_were_ordered() -> None:
     assert sum(first) / 400 == pytest.approx(0.7 * 0.7, abs=0.08)
 
 
-@pytest.mark.parametrize("rate", list(esb.BITRATES))
+@pytest.mark.parametrize("rate", list(BITRATES))
 @pytest.mark.parametrize("count", [1, 4])
 def test_the_bridges_budget_is_what_a_dongle_carries(rate: str, count: int) -> None:
     """One exchange after the other, as cflib does it, for half a second."""
@@ -176,7 +175,7 @@ def test_what_the_devices_cannot_do() -> None:
     assert room.dongles[0].sniffer.tuned is None
 
 
-SHARED = Station("", 80, "2M", esb.BROADCAST)
+SHARED = RadioAddress("", 80, "2M", BROADCAST)
 SPOKEN = bytes((0xFF, 0x87)) + bytes(range(60))
 THREE = RadioSettings(dongles=3, request_ms=0.0)
 
@@ -185,7 +184,7 @@ THREE = RadioSettings(dongles=3, request_ms=0.0)
 class Ears:
     """What a host reads of a dongle in sniffer mode, as long as it reads."""
 
-    dongle: Dongle
+    dongle: DongleModel
     room: Room
     reads: bool = True
     packets: list[tuple[int, bytes]] = field(default_factory=list)
@@ -207,7 +206,7 @@ class Ears:
         return [data[7:] for _, data in self.packets]
 
 
-def sniffing(settings: RadioSettings = THREE, stations: tuple[Station, ...] = ()) -> tuple[Room, list[Ears]]:
+def sniffing(settings: RadioSettings = THREE, stations: tuple[RadioAddress, ...] = ()) -> tuple[Room, list[Ears]]:
     room = Room(settings, stations)
     for k in range(settings.dongles):
         room.tune(k, SHARED)
@@ -218,7 +217,7 @@ def test_in_sniffer_mode_a_packet_leaves_within_a_millisecond_and_others_hear_it
     waits = []
     for seed in range(20):
         room, (one, two, three) = sniffing(RadioSettings(dongles=3, request_ms=0.0, seed=seed))
-        assert room.exchange(esb.BROADCAST + SPOKEN, at_ns=5_000 * US) == []
+        assert room.exchange(BROADCAST + SPOKEN, at_ns=5_000 * US) == []
         assert one.packets == []
         assert two.payloads == three.payloads == [SPOKEN]
         ((when, data),) = two.packets
@@ -238,7 +237,7 @@ def test_who_sends_is_deaf_and_two_at_a_time_destroy_each_other() -> None:
     for number in range(40):
         at = 5_000 * US * (number + 1)
         for dongle in (0, 1):
-            room.dongles[dongle].transfer(esb.BROADCAST + SPOKEN[:2] + bytes((number, dongle)), at, lambda _: None)
+            room.dongles[dongle].transfer(BROADCAST + SPOKEN[:2] + bytes((number, dongle)), at, lambda _: None)
         room.run()
         heard = [{p[3] for p in each.payloads if p[2] == number} for each in ears]
         assert heard[0] <= {1}
@@ -255,7 +254,7 @@ def test_packets_that_are_not_fetched_wait_and_more_than_eight_are_dropped_and_c
     ears = Ears(room.dongles[1], room, reads=False)
     Ears(room.dongles[0], room)
     for number in range(12):
-        room.exchange(esb.BROADCAST + SPOKEN[:2] + bytes((number,)), at_ns=5_000 * US * (number + 1))
+        room.exchange(BROADCAST + SPOKEN[:2] + bytes((number,)), at_ns=5_000 * US * (number + 1))
     assert ears.packets == []
     assert room.dongles[1].sniffer.dropped == 4
     ears.reads = True
@@ -280,8 +279,8 @@ def test_a_sniffer_hears_its_two_addresses_and_broadcasts_are_not_for_the_ground
     empty = bytes((0xF3, 0x01, 45))
     assert [(data[2], data[7:]) for _, data in ears.packets] == [(0, PACKET), (0, empty), (1, PACKET), (1, empty)]
     room, _ = sniffing(THREE, (station(1),))
-    room.exchange(esb.BROADCAST + SPOKEN, at_ns=5_000 * US)
+    room.exchange(BROADCAST + SPOKEN, at_ns=5_000 * US)
     assert room.heard == []
-    room.exchange(esb.BROADCAST + PACKET, at_ns=10_000 * US)
+    room.exchange(BROADCAST + PACKET, at_ns=10_000 * US)
     assert room.heard == [(0, PACKET)]
-    room.exchange(esb.BROADCAST, at_ns=15_000 * US)  # an address alone is no packet
+    room.exchange(BROADCAST, at_ns=15_000 * US)  # an address alone is no packet

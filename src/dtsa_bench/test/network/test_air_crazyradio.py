@@ -26,7 +26,7 @@ from dtsa_agent.keys import authenticator
 from dtsa_bench.commands.cli import main
 from dtsa_bench.crazyflies.peer_lab.app import LabSettings
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
-from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard
+from dtsa_bench.crazyflies.peer_lab.onboard import OnboardSwarm
 from dtsa_bench.crazyflies.simulated.process import running_fleet
 from dtsa_bench.log.agent_bag import read
 from dtsa_bench.log.merge.merge import Merge
@@ -112,7 +112,7 @@ def test_agents_become_one_group_on_one_time_line_and_keep_the_rules(flight: Sim
 def test_a_computer_reads_what_the_app_on_board_says(auth: bool, tmp_path: Path) -> None:
     """On its port, with its header or its tag; and its own frames are such ones."""
     swarm = SwarmConfig(agents=3, policy="lease", auth=auth, auth_session=3 if auth else 0)
-    with OnBoard(swarm, LabSettings(), tmp_path, key=bytes.fromhex(KEY) if auth else b"", enable_s=6.0) as flight:
+    with OnboardSwarm(swarm, LabSettings(), tmp_path, key=bytes.fromhex(KEY) if auth else b"", enable_s=6.0) as flight:
         flight.lab.run(5.0)
         port = flight.lab.parameter(1, "dtsa.port")
         flight.finish()

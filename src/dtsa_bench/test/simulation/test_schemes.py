@@ -17,7 +17,7 @@ from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.plugins.kinds import Table
 from dtsa_agent.core.registry import POLICIES
-from dtsa_agent.crazyflie.settings import StationSettings, SwarmSettings
+from dtsa_agent.crazyflie.settings import GroundStationSettings, SwarmSettings
 from dtsa_agent.stop import Stop
 from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
 from dtsa_bench.experiments.sweep import run_config
@@ -352,7 +352,7 @@ def test_nodes_refuse_what_nodes_cannot_do() -> None:
     with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: a policy with slots"):
         AgentGroup(make_swarm(SwarmConfig(agents=4, policy="pure-aloha")))
     mission = RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime")
-    settings = SwarmSettings((), StationSettings())
+    settings = SwarmSettings((), GroundStationSettings())
     with pytest.raises(ConfigError, match="policy: got 'beacons'; allowed: a policy with slots"):
         fly_crazyflies(mission, settings, Path("swarm.yaml"), Path("out"), FlightOptions(), Stop())
     with pytest.raises(ConfigError, match="policy"):

@@ -2,8 +2,7 @@
 
     python -m dtsa_agent.crazyflie.node.agents_node --ros-args -p agents:=12 -p policy:=lease ...
 
-The node is a `swarm_host` whose vehicles are flown by somebody else. Protocol, estimator and avoider are untouched:
-only the motion of the vehicles is not simulated.
+The node is a `swarm_host` whose vehicles are not simulated. Protocol, estimator and avoider are the same.
 """
 
 from __future__ import annotations
@@ -46,101 +45,98 @@ LONGEST_PREDICTION_S = 0.15
 WORLD = "world"  # frame of the bridge's odometry
 HOLD_GAIN = 1.0  # 1/s, for agents that hover: real air does not leave them where they are
 HOLD_MPS = 0.3
-SPREAD_M = 0.45  # horizontally: closer than this nobody comes to rest, since all land straight down
-NOWHERE_M = 1e-3
-PUSH_M = 0.3  # farther than this at once nobody makes way
+SPREAD_M = 0.45  # horizontal distance at which agents come to rest, since all land straight down
+SAME_PLACE_M = 1e-3
+PUSH_M = 0.3  # farthest that an agent makes way at once
+FENCE_GAIN = 1.5  # 1/s: commands towards the fence shrink with the distance, for a vehicle outside ends the mission
 
 
 class ExternalVehicles:
-    """Vehicles that agents steer and somebody else flies.
+    """Vehicles that agents steer and another program flies.
 
     :param swarms: the agents, in one or several swarms; positions and velocities are written into them from outside.
     :param every: slots between two commands.
     :param send: takes the place of a swarm and its agents' commanded velocities, m/s, frame map.
+    :param fence: m, frame map, corners of the box that no command leads out of; None: there is none.
     """
 
-    def __init__(self, swarms: Sequence[Swarm], every: int, send: Callable[[int, NDArray[np.float64]], None]) -> None:
+    def __init__(
+        self, swarms: Sequence[Swarm], every: int, send: Callable[[int, NDArray[np.float64]], None],
+        fence: tuple[Vector, Vector] | None = None,
+    ) -> None:  # fmt: skip
         self._swarms, self._every, self._send = swarms, every, send
+        self._fence = None if fence is None else np.array(fence)[:, :, None]
         ends = np.cumsum([len(swarm.ids) for swarm in swarms]).tolist()
         self._columns = [slice(end - len(swarm.ids), end) for swarm, end in zip(swarms, ends, strict=True)]
         self._stopping = False
 
-    def place(self, position: NDArray[np.float64]) -> None:
-        """Takes in where the vehicles are, (3, L) m, frame map."""
+    def set_positions(self, position: NDArray[np.float64]) -> None:
+        """Set where the vehicles are, (3, L) m, frame map."""
         for swarm, columns in zip(self._swarms, self._columns, strict=True):
             swarm.position[:] = swarm.track[:] = position[:, columns]
 
     def stop_here(self) -> None:
-        """From now on nobody flies to its goal: all come to rest, and nobody above another one.
-
-        They keep out of each other's way as before.
-        """
+        """Have all agents come to rest, none above another one; they avoid each other as before."""
         self._stopping = True
 
-    def fly(self, slot: int, index: int = 0) -> None:
-        """Sends the commands of a slot to the vehicles of a swarm."""
+    def send_commands(self, slot: int, index: int = 0) -> None:
+        """Send the commands of a slot to the vehicles of a swarm."""
         if slot % self._every:
             return
         swarm = self._swarms[index]
         goal = swarm.goal.copy()  # the protocol still counts with it
         if self._stopping:
-            swarm.goal[:] = swarm.position + self._way()[:, self._columns[index]]
+            swarm.goal[:] = swarm.position + self._separation()[:, self._columns[index]]
         swarm.steer(slot, 0)
         swarm.goal[:] = goal
         still = swarm.active == 0
         if still.any():
             away = (swarm.scenario.start[:, swarm.local] - swarm.position)[:, still]
             swarm.command[:, still] = np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
+        if self._fence is not None:
+            low, high = FENCE_GAIN * (self._fence - swarm.position)
+            swarm.command[:] = np.clip(swarm.command, low, high)
         self._send(index, swarm.command)
 
-    def _way(self) -> NDArray[np.float64]:
-        """Where each goes to make way for those that are near horizontally, at whatever height, (3, L) m."""
+    def _separation(self) -> NDArray[np.float64]:
+        """Return where each agent goes to get away from those that are near horizontally, (3, L) m."""
         position = np.concatenate([swarm.position for swarm in self._swarms], axis=1)
         apart = position[:2, :, None] - position[:2, None, :]
         distance = np.linalg.norm(apart, axis=0)
         index = np.arange(distance.shape[0])
-        above = (distance < NOWHERE_M) & (index[:, None] != index)  # one right above the other: by their numbers
-        apart[0] += np.where(above, np.sign(index[:, None] - index) * NOWHERE_M, 0.0)
-        distance = np.maximum(np.linalg.norm(apart, axis=0), NOWHERE_M)
-        way = np.zeros_like(position)
-        way[:2] = (apart / distance * np.maximum(SPREAD_M - distance, 0.0)).sum(axis=2)
-        return way * np.minimum(1.0, PUSH_M / np.maximum(np.linalg.norm(way, axis=0), NOWHERE_M))
+        above = (distance < SAME_PLACE_M) & (index[:, None] != index)  # one right above another: by their numbers
+        apart[0] += np.where(above, np.sign(index[:, None] - index) * SAME_PLACE_M, 0.0)
+        distance = np.maximum(np.linalg.norm(apart, axis=0), SAME_PLACE_M)
+        push = np.zeros_like(position)
+        push[:2] = (apart / distance * np.maximum(SPREAD_M - distance, 0.0)).sum(axis=2)
+        return push * np.minimum(1.0, PUSH_M / np.maximum(np.linalg.norm(push, axis=0), SAME_PLACE_M))
 
 
-class StationNode(RealtimeNode):
+class CrazyflieAgents(RealtimeNode):
     """Agents that begin their slots by the station's clock and whose vehicles are flown elsewhere.
 
     :param command_hz: rate of the commands, Hz; at most one a slot.
     :param vehicles: names of the agents' vehicles.
     :param origin: m, where the vehicles' world sees the origin of `map`.
+    :param fence: of `ExternalVehicles`.
     """
 
     def __init__(
         self, node: Node, config: SwarmConfig, *args: Any, command_hz: float, vehicles: Sequence[str],
-        origin: Vector, **more: Any,
+        origin: Vector, fence: tuple[Vector, Vector] | None, **more: Any,
     ) -> None:  # fmt: skip
         super().__init__(node, config, *args, **more)
         every, swarms = max(1, round(1.0 / command_hz / config.slot_s)), [agent.swarm for agent in self.agents]
-        self._vehicles, count = ExternalVehicles(swarms, every, self._command), len(swarms)
+        self._vehicles, count = ExternalVehicles(swarms, every, self._command, fence), len(swarms)
         self._names, self._origin = vehicles, origin
-        self._heard = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
+        self._odometry_time = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
         self._stamp = np.zeros(count)  # s, system clock, of that
-        self._inputs: list[Feed] = []
-        self._bridges: list[PublisherGuard] = []  # who tells where each vehicle is
-        self._outputs = []
-        self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=self.membership.intake)
-        for name in vehicles:
-            self._inputs.append(
-                Feed(node, Odometry, f"/{name}/{names.ODOMETRY}", LATEST, intake=self.membership.intake)
-            )
-            self._bridges.append(PublisherGuard())
-            self._outputs.append(node.create_publisher(VelocityWorld, f"/{name}/cmd_velocity_world", 1))
-
-    @property
-    def _blind(self) -> bool:
-        """Whether some agent does not know yet where it is."""
-        return bool(np.isinf(self._heard).any())
+        intake = self.membership.intake
+        self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=intake)
+        self._inputs = [Feed(node, Odometry, f"/{name}/{names.ODOMETRY}", LATEST, intake=intake) for name in vehicles]
+        self._bridges = [PublisherGuard() for _ in vehicles]  # sources of odometry
+        self._outputs = [node.create_publisher(VelocityWorld, f"/{name}/cmd_velocity_world", 1) for name in vehicles]
 
     def _sense(self) -> None:
         if self._stop_here.take() is not None:
@@ -149,59 +145,56 @@ class StationNode(RealtimeNode):
             message = feed.take()
             if message is not None:
                 with self.membership.intake.guard():
-                    self._check(index, message, feed)
-                    self._note(index, message)
+                    self._accept(index, message, feed)
         # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
         age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)
         velocity = np.concatenate([agent.swarm.velocity for agent in self.agents], axis=1)
-        self._vehicles.place(self._measured + velocity * age)
+        self._vehicles.set_positions(self._measured + velocity * age)
 
-    def _check(self, index: int, message: Odometry, feed: Feed) -> None:
-        """Whether odometry can be that of a vehicle, and of the bridge that has told of it so far.
+    def _accept(self, index: int, message: Odometry, feed: Feed) -> None:
+        """Check and store a vehicle's odometry. Without any for a while it gets no commands, and the bridge holds it.
 
-        :raises BadMessage: if it cannot. Without any for a while the vehicle gets no commands, and the bridge holds it.
+        :raises BadMessage: it is not from the bridge that sent it so far, or cannot be.
         """
         check_odometry(message)
         if not self._bridges[index].admits(time.monotonic(), feed.sender):
             raise BadMessage(OTHER_SENDER, f"odometry of {self._names[index]} from two publishers")
-
-    def _note(self, index: int, message: Odometry) -> None:
         place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
         x, y, z = self._origin if message.header.frame_id == WORLD else (0.0, 0.0, 0.0)
         self._measured[:, index] = place.x - x, place.y - y, place.z - z
         self._stamp[index] = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
         # The twist of an odometry message is in the body's frame (REP-103).
         self.agents[index].swarm.velocity[:, 0] = rotate((q.x, q.y, q.z, q.w), (speed.x, speed.y, speed.z))
-        self._heard[index] = time.monotonic()
+        self._odometry_time[index] = time.monotonic()
 
     def _command(self, index: int, velocity: NDArray[np.float64]) -> None:
-        """Publishes the command to a vehicle, (3, 1), m/s, frame map."""
-        if time.monotonic() - self._heard[index] < STALE_S:
+        """Publish the command to a vehicle, (3, 1), m/s, frame map."""
+        if time.monotonic() - self._odometry_time[index] < STALE_S:
             message = VelocityWorld()
             message.vel.x, message.vel.y, message.vel.z = velocity[:, 0].tolist()
             self._outputs[index].publish(message)
 
     def _prepare(self, message: Fields) -> bool:
         self._sense()
-        if message.phase == Slot.PREPARE and self._blind:
+        if message.phase == Slot.PREPARE and np.isinf(self._odometry_time).any():
             return True
         return super()._prepare(message)
 
     def _fly(self, index: int) -> None:
-        self._vehicles.fly(self.agents[index].slot, index)
+        self._vehicles.send_commands(self.agents[index].slot, index)
 
 
 @dataclass(frozen=True, slots=True)
-class StationNodeSettings(Settings):
-    """What the node needs beside what the whole swarm agrees on.
-
-    :raises ConfigError: for values that are not allowed.
-    """
+class CrazyflieAgentsSettings(Settings):
+    """What the node needs beside what the whole swarm agrees on."""
 
     command_hz: float = setting(50.0, "rate of the commands", unit="Hz", minimum=1, maximum=100)
     priority: int = setting(0, "real-time priority; 0: none", minimum=0, maximum=90)
     vehicles: str = setting("", "names of the vehicles of all agents, with blanks between; empty: cf1, cf2, ...")
     origin: Vector = setting((0.0, 0.0, 0.0), "where the vehicles' world sees the origin of map", unit="m")
+    fence: bool = setting(False, "give no command that leads out of the box between fence_min and fence_max")
+    fence_min: Vector = setting((-1.5, -2.3, -0.95), "lower corner of the box, frame map", unit="m")
+    fence_max: Vector = setting((1.5, 2.3, 0.95), "upper corner of the box, frame map", unit="m")
 
 
 def _body(stop: Stop, supervised: bool) -> None:
@@ -210,7 +203,7 @@ def _body(stop: Stop, supervised: bool) -> None:
     try:
         config = declare_swarm(node)
         ids = declare_ids(node, config.agents)
-        station = StationNodeSettings(**declare_settings(node, StationNodeSettings))
+        station = CrazyflieAgentsSettings(**declare_settings(node, CrazyflieAgentsSettings))
         set_realtime(station.priority)
         check_parameters(node)
         vehicles = station.vehicles.split() or [f"cf{k}" for k in range(1, config.agents + 1)]
@@ -219,7 +212,8 @@ def _body(stop: Stop, supervised: bool) -> None:
         # One station, one clock: no offsets, and nothing to align.
         more = {"authenticator": authenticator(config), "align": False, "command_hz": station.command_hz}
         more |= {"vehicles": [vehicles[k - 1] for k in ids], "origin": station.origin}
-        agents = StationNode(node, config, ids, space, **more)
+        more["fence"] = (station.fence_min, station.fence_max) if station.fence else None
+        agents = CrazyflieAgents(node, config, ids, space, **more)
         try:
             agents.run(stop)
         finally:
@@ -229,7 +223,7 @@ def _body(stop: Stop, supervised: bool) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Runs the node."""
+    """Run the node."""
     return run_node("crazyflie_agents", _body, args)
 
 

@@ -36,7 +36,7 @@ from dtsa_agent.ros.common.parameters import check_parameters, declare_settings
 
 from .interfaces import NODE
 from .preflight import FAIL, preflight
-from .topics import Inputs, Outputs, helper_node, subscribe_positions
+from .topics import BridgeInputs, BridgeOutputs, helper_node, subscribe_positions
 
 STATUS_HZ = 5.0
 SETTLE_S = 1.2  # of a check before flight
@@ -71,10 +71,10 @@ class BridgeNode(Node):
         check_parameters(self)
         station = dataclasses.replace(settings.station, safety=safety, positions=positions)
         self.settings = dataclasses.replace(settings, station=station)
-        self.outputs = Outputs(self, self.settings)
-        self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
+        self.outputs = BridgeOutputs(self, self.settings)
+        self.bridge = Bridge(self.settings, self.log, self.outputs.publish_state)
         self.command_thread = CommandThread(helper_node(self, "commands"))
-        self._inputs = Inputs(self, self.bridge, self.command_thread, self.say)
+        self._inputs = BridgeInputs(self, self.bridge, self.command_thread, self.log)
         self.positions = CommandThread(helper_node(self, "positions")) if positions.on else None
         if self.positions is not None:
             subscribe_positions(self.positions, positions, self.bridge.vehicles)
@@ -86,7 +86,7 @@ class BridgeNode(Node):
             self.positions.close()
         self.destroy_node()
 
-    def say(self, level: str, line: str) -> None:
+    def log(self, level: str, line: str) -> None:
         """One line in the log, and on the topic of events."""
         self.outputs.publish_event(level, line)
         logger = self.get_logger()  # rclpy wants each place in the code to keep to one level
@@ -110,16 +110,16 @@ class BridgeNode(Node):
         if stop():
             return "interrupted while connecting"
         total = len(self.bridge.vehicles)
-        self.say("info", f"{total - len(missing)} of {total} connected in {time.monotonic() - began:.2f} s")
+        self.log("info", f"{total - len(missing)} of {total} connected in {time.monotonic() - began:.2f} s")
         if missing:
-            self.say("warn", f"not connected: {', '.join(missing)} (service reconnect)")
+            self.log("warn", f"not connected: {', '.join(missing)} (service reconnect)")
         if self.bridge.connected < self.settings.station.min_connected:
             return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
         if self.settings.station.on_board.on:
             if problem := self.bridge.start_agents():
                 return problem
             rate = self.settings.station.on_board.polls_hz
-            self.say("info", f"agents started on board; from now on {rate:g} packets a second to each")
+            self.log("info", f"agents started on board; from now on {rate:g} packets a second to each")
         self._inputs.offer()
         self.create_timer(1.0 / STATUS_HZ, lambda: self.outputs.publish_status(self.bridge.snapshots()))
         self.create_timer(1.0, lambda: self.outputs.publish_diagnostics(self.bridge.snapshots()))
@@ -129,9 +129,9 @@ class BridgeNode(Node):
 class _Interrupts:
     """The first Ctrl-C (or SIGTERM, or a terminal that is closed) lands all; one more Ctrl-C is the emergency stop.
 
-    Only that: who starts processes, like `ros2 launch`, sends SIGTERM to those that take long to end.
+    Only that: programs that start processes, like `ros2 launch`, send SIGTERM to those that take long to end.
     Signals may come at once. A handler that interrupts another one must not wait for a lock that this one holds, as
-    that of `threading.Event` does: the bridge would stand still, and nobody would land.
+    that of `threading.Event` does: the bridge would stand still, and no vehicle would land.
     """
 
     def __init__(self) -> None:
@@ -164,27 +164,27 @@ def run_node(node: BridgeNode) -> int:
     sys.setswitchinterval(SWITCH_S)
     level = node.settings.station.priority
     if level and (problem := set_realtime(level)):
-        node.say("warn", f"no real-time priority ({problem}): keep this station free of other work")
+        node.log("warn", f"no real-time priority ({problem}): keep this station free of other work")
     elif level:
         use_last_processor()
     problem = node.start(interrupts.any)
     if problem:
-        node.say("error", problem)
+        node.log("error", problem)
         node.bridge.close()
         return 1
     serving = ExecutorThread(node.context, "executor", node)
     serving.start()
-    node.say("info", "ready; Ctrl-C lands all, a second one stops all motors")
+    node.log("info", "ready; Ctrl-C lands all, a second one stops all motors")
     interrupts.wait()
     code = _end(node, interrupts)
     serving.close()
     return code
 
 
-def check_node(node: BridgeNode, say: Callable[[str], None]) -> int:
+def check_node(node: BridgeNode, print_line: Callable[[str], None]) -> int:
     """Connect, look at everything that a flight needs, and close; exit code 1 if something is missing.
 
-    No motor turns, and the emergency watchdog is not fed: afterwards everybody can fly as before.
+    No motor turns, and the emergency watchdog is not fed: afterwards all can fly as before.
     """
     interrupts = _Interrupts()
     level = node.settings.station.priority
@@ -197,26 +197,26 @@ def check_node(node: BridgeNode, say: Callable[[str], None]) -> int:
     findings = preflight(node.settings, node.bridge.snapshots(), firmware, node.bridge.radios, problem)
     node.bridge.close()
     for finding in findings:
-        say(str(finding))
+        print_line(str(finding))
     return int(any(finding.level == FAIL for finding in findings))
 
 
 def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
     bridge = node.bridge
     bridge.end_heartbeat()  # from here on the bridge alone brings them down
-    flying = first = bridge.in_air(time.monotonic())
+    flying = first = bridge.names_in_air(time.monotonic())
     if flying:
-        node.say("warn", f"landing {', '.join(flying)}; Ctrl-C again stops all motors")
+        node.log("warn", f"landing {', '.join(flying)}; Ctrl-C again stops all motors")
         bridge.land_all("the bridge ends")
         flying = bridge.wait_landed(lambda: interrupts.count > 1)
     if interrupts.count > 1:
         bridge.stop_all("second Ctrl-C")
         time.sleep(0.3)  # three packets a vehicle, then the links may close
     elif flying:
-        node.say("error", f"still flying: {', '.join(flying)}")
+        node.log("error", f"still flying: {', '.join(flying)}")
     lost = [name for name in first if name not in flying and bridge.vehicles[name].state == State.LOST]
     if lost:
-        node.say("error", f"not known to have landed: {', '.join(lost)}")
+        node.log("error", f"not known to have landed: {', '.join(lost)}")
     bridge.close()
     return 0 if interrupts.count == 1 and not (flying or lost) else 1
 

@@ -19,9 +19,9 @@ except ImportError:
     STATE = "status"
 
 NODE = "crazyflie_server"
-STOP_HERE = "/all/stop_here"  # of a mission's ground station: nobody flies on to its goal
+STOP_HERE = "/all/stop_here"  # of a mission's ground station: no agent flies on to its goal
 EVENTS = "/all/events"  # what the bridge does, and what it was ordered to do: its log
-EVENTS_QOS = QoSProfile(depth=500, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for those who come late
+EVENTS_QOS = QoSProfile(depth=500, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for subscribers that come late
 
 FullState: Any = msg.FullState
 Position: Any = msg.Position

@@ -9,10 +9,10 @@ from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
-from rclpy.parameter import Parameter as RosParameter
+from rclpy.parameter import Parameter
 
 from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.link import Link
+from dtsa_agent.crazyflie.link import CrazyflieLink
 
 FLOATS = frozenset({"float", "FP16", "double"})
 ALL = "all"
@@ -21,7 +21,7 @@ GROUPS = "hlCommander.groupmask"
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class FirmwareParameter:
     """One parameter of the firmware."""
 
     name: str  # group.name
@@ -44,12 +44,12 @@ class Parameter:
         return ""
 
 
-def read_parameters(link: Link) -> dict[str, Parameter]:
+def read_parameters(link: CrazyflieLink) -> dict[str, FirmwareParameter]:
     """Return all parameters of a Crazyflie by their names, as far as they were read."""
     cf = link.crazyflie
     if cf is None:
         return {}
-    found = {}
+    parameters = {}
     for group, elements in dict(cf.param.toc.toc).items():
         for name, element in dict(elements).items():
             text = cf.param.values.get(group, {}).get(name)
@@ -59,24 +59,24 @@ def read_parameters(link: Link) -> dict[str, Parameter]:
             value = link.robot.firmware_params.get(full)  # was set a moment ago
             if value is None:
                 value = float(text) if element.ctype in FLOATS else int(text)
-            found[full] = Parameter(full, element.ctype, element.access == element.RO_ACCESS, value)
-    return found
+            parameters[full] = FirmwareParameter(full, element.ctype, element.access == element.RO_ACCESS, value)
+    return parameters
 
 
 class FirmwareParameters:
     """Parameters of the node that are those of the connected Crazyflies.
 
-    :param say: called with a level and a line about each that is set.
+    :param log: called with a level and a line about each that is set.
     :param masks: the groups of each robot by its name; changed with the firmware's own.
     """
 
-    def __init__(self, node: Node, bridge: Bridge, say: Callable[[str, str], None], masks: dict[str, int]) -> None:
-        self._node, self._bridge, self._say, self._masks = node, bridge, say, masks
-        self._known: dict[str, dict[str, Parameter]] = {}
+    def __init__(self, node: Node, bridge: Bridge, log: Callable[[str, str], None], masks: dict[str, int]) -> None:
+        self._node, self._bridge, self._log, self._masks = node, bridge, log, masks
+        self._known: dict[str, dict[str, FirmwareParameter]] = {}
 
     def declare(self) -> None:
         """Declare all: addresses and places of the robots, and what the connected ones have."""
-        common: dict[str, Parameter] = {}
+        common: dict[str, FirmwareParameter] = {}
         for name, vehicle in self._bridge.vehicles.items():
             self._declare(f"robots.{name}.uri", vehicle.robot.uri, read_only=True)
             self._declare(f"robots.{name}.initial_position", list(vehicle.robot.initial_position), read_only=True)
@@ -92,16 +92,16 @@ class FirmwareParameters:
     def _declare(self, name: str, value: Any, *, read_only: bool) -> None:
         self._node.declare_parameter(name, value, ParameterDescriptor(read_only=read_only), ignore_override=True)
 
-    def _check(self, parameters: Sequence[RosParameter]) -> SetParametersResult:
+    def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Whether all can be set."""
         for given in parameters:
-            owner, found, name = given.name.partition(PARAMS)
-            for robot in self._owners(owner, name) if found else ():
+            owner, separator, name = given.name.partition(PARAMS)
+            for robot in self._owners(owner, name) if separator else ():
                 problem = self._known[robot][name].problem(given.value)
                 if owner != ALL and not self._bridge.vehicles[robot].link.can_set:
                     problem = f"{robot} is not connected, or its parameters are being read"
                 if problem:
-                    self._say("warn", f"parameter {given.name}: {problem}")
+                    self._log("warn", f"parameter {given.name}: {problem}")
                     return SetParametersResult(successful=False, reason=problem)
         return SetParametersResult(successful=True)
 
@@ -110,17 +110,17 @@ class FirmwareParameters:
         robots = list(self._known) if owner == ALL else [owner]
         return [robot for robot in robots if name in self._known.get(robot, {})]
 
-    def _apply(self, parameters: Sequence[RosParameter]) -> None:
+    def _apply(self, parameters: Sequence[Parameter]) -> None:
         """Send what was set; for all: set it for each of them."""
         for given in parameters:
-            owner, found, name = given.name.partition(PARAMS)
-            if not found:
+            owner, separator, name = given.name.partition(PARAMS)
+            if not separator:
                 continue
             if owner == ALL:
                 robots = [r for r in self._owners(owner, name) if self._bridge.vehicles[r].link.can_set]
-                self._node.set_parameters([RosParameter(f"{r}{PARAMS}{name}", value=given.value) for r in robots])
+                self._node.set_parameters([Parameter(f"{r}{PARAMS}{name}", value=given.value) for r in robots])
                 continue
             self._bridge.vehicles[owner].link.set_parameter(name, given.value)
             if name == GROUPS:
                 self._masks[owner] = int(given.value)
-            self._say("info", f"parameter {given.name} = {given.value:g}")
+            self._log("info", f"parameter {given.name} = {given.value:g}")

@@ -13,7 +13,7 @@ from dtsa_agent.crazyflie.state import State, VehicleState, place_text
 from dtsa_agent.crazyflie.vehicle import OFF, Snapshot
 
 if TYPE_CHECKING:
-    from dtsa_agent.crazyflie.drivers import Radios  # importing it wants cflib
+    from dtsa_agent.crazyflie.drivers import DongleSet  # importing it wants cflib
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 FAR_M = 0.25  # from its initial_position
@@ -37,7 +37,7 @@ class Finding(NamedTuple):
 
 
 def preflight(
-    settings: SwarmSettings, snapshots: Sequence[Snapshot], firmware: Firmware, radios: Radios, priority_problem: str
+    settings: SwarmSettings, snapshots: Sequence[Snapshot], firmware: Firmware, radios: DongleSet, priority_problem: str
 ) -> list[Finding]:
     """Return the whole list.
 
@@ -149,7 +149,7 @@ def _geofence(settings: SwarmSettings, here: Here) -> Items:
     yield OK, f"{low} to {high} in map; all stand inside"
 
 
-def _budget(settings: SwarmSettings, radios: Radios) -> Items:
+def _budget(settings: SwarmSettings, radios: DongleSet) -> Items:
     loads, bad = settings.loads, WARN if settings.station.force_budget else FAIL
     for load in loads:
         yield OK if load.fits else bad, str(load)
@@ -159,7 +159,7 @@ def _budget(settings: SwarmSettings, radios: Radios) -> Items:
         yield OK, "no radios (udp, usb)"
 
 
-def _emergency(settings: SwarmSettings, radios: Radios) -> Items:
+def _emergency(settings: SwarmSettings, radios: DongleSet) -> Items:
     if not settings.loads:
         yield OK, "by the links: there are no radios"
     elif radios.spare is None:

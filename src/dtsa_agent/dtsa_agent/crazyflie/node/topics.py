@@ -27,10 +27,10 @@ from std_srvs.srv import Empty, SetBool, Trigger
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.commands import FULL_STATE, POSITION, VELOCITY_WORLD, CommandInput, CommandThread
-from dtsa_agent.crazyflie.positions import NAMED_POSES, PositionSettings, Tracker
+from dtsa_agent.crazyflie.positions import NAMED_POSES, PoseTracker, PositionSettings
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state import State, VehicleState, place_text, rotate_inverse
-from dtsa_agent.crazyflie.vehicle import OFF, Snapshot, Vehicle
+from dtsa_agent.crazyflie.vehicle import OFF, CrazyflieVehicle, Snapshot
 from dtsa_agent.ros.common.cdr import UNKNOWN, diagonal
 
 from . import interfaces
@@ -39,7 +39,7 @@ from .parameters import FirmwareParameters
 
 FRAME = "world"
 LATEST_ONLY = QoSProfile(depth=1)
-# Whoever publishes, reliably or not; a pose that is late is worth nothing.
+# Takes reliable publishers and others; a pose that is late is worth nothing.
 SENSOR = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LEVELS = {"info": 20, "warn": 30, "error": 40}
 ARMED_S, ARMED_POLL_S = 3.0, 0.02  # longest wait for motors that are to run, or to be locked
@@ -48,7 +48,7 @@ LOW_POWER = 3  # pm_state
 # positioning system. Body rates are not logged.
 POSE_COVARIANCE = diagonal(0.03**2, 0.1**2)
 TWIST_COVARIANCE = diagonal(0.1**2, UNKNOWN)
-Say = Callable[[str, str], None]
+LogLine = Callable[[str, str], None]
 
 
 def seconds(duration: DurationMsg) -> float:
@@ -72,27 +72,27 @@ def helper_node(node: Node, name: str) -> Node:
 
 
 # -- what comes in ----------------------------------------------------------------------------------------------------
-class Inputs:
+class BridgeInputs:
     """Streamed commands, services, the ground station's heartbeat.
 
     :param commands: reads the streamed commands; not started yet.
     """
 
-    def __init__(self, node: Node, bridge: Bridge, commands: CommandThread, say: Say) -> None:
-        self._node, self._bridge, self._commands, self._say = node, bridge, commands, say
+    def __init__(self, node: Node, bridge: Bridge, commands: CommandThread, log: LogLine) -> None:
+        self._node, self._bridge, self._commands, self._log = node, bridge, commands, log
         self._on_board = bridge.settings.station.on_board.on
         self._waiting = ReentrantCallbackGroup()  # of services that wait: the others are served meanwhile
         self._masks = {name: vehicle.robot.group_mask for name, vehicle in bridge.vehicles.items()}
 
     def offer(self) -> None:
-        """Create everything; `/all/emergency` is last: whoever waits for it knows that everything else is there."""
+        """Create everything; `/all/emergency` is last: a program that waits for it knows that all else is there."""
         streams = (
             (interfaces.FullState, "cmd_full_state", FULL_STATE),
             (interfaces.Position, "cmd_position", POSITION),
             (interfaces.VelocityWorld, "cmd_velocity_world", VELOCITY_WORLD),
         )
         warn = partial(self._node.get_logger().warning, throttle_duration_sec=1.0)
-        FirmwareParameters(self._node, self._bridge, self._say, self._masks).declare()
+        FirmwareParameters(self._node, self._bridge, self._log, self._masks).declare()
         for name, vehicle in self._bridge.vehicles.items():
             for message, topic, kind in () if self._on_board else streams:  # agents on board steer themselves
                 read = CommandInput(kind, vehicle.controls, vehicle.station, name, warn)
@@ -100,7 +100,7 @@ class Inputs:
             self._create_services(name, [name])
             self._node.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
         self._commands.start()
-        self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.heartbeat(), LATEST_ONLY)
+        self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.note_heartbeat(), LATEST_ONLY)
         self._node.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
         self._create_services("all", list(self._bridge.vehicles))
 
@@ -126,26 +126,31 @@ class Inputs:
 
     async def _ordered(self, name: str, callback: Callable[[Any], Any], request: Any, response: Any) -> Any:
         """Carry out an order, and say so: what an operator did belongs to what happened."""
-        result = callback(request)
-        done, text = await result if hasattr(result, "__await__") else result
+        try:
+            result = callback(request)
+            done, text = await result if hasattr(result, "__await__") else result
+        except Exception as error:  # of this order: emergency stops must still be answered
+            done, text = False, f"{type(error).__name__}: {error}"
         fields = ", ".join(f"{key} {_short(getattr(request, key))}" for key in request.get_fields_and_field_types())
-        self._say("info" if done else "warn", f"order /{name} ({fields}): {'done' if done else text}")
+        self._log("info" if done else "warn", f"order /{name} ({fields}): {'done' if done else text}")
         if hasattr(response, "success"):
             response.success, response.message = done, text
         return response
 
-    def _each(self, names: list[str], order: Callable[[Vehicle], str | None], group: int = 0) -> tuple[bool, str]:
+    def _each(
+        self, names: list[str], order: Callable[[CrazyflieVehicle], str | None], group: int = 0
+    ) -> tuple[bool, str]:
         """Give an order to those that are addressed (group 0: to all of them; else to those in one of these groups)."""
         members = [name for name in names if not group or self._masks[name] & group]
         if not members:
             return False, f"nobody of {', '.join(names)} is in a group of {group}"
-        return self._bridge.each(members, order)
+        return self._bridge.order_each(members, order)
 
     def _refuse(self, names: list[str], request: Any) -> tuple[bool, str]:
         return False, "trajectories are not supported: send positions, velocities or go_to"
 
     def _takeoff(self, names: list[str], request: Any) -> tuple[bool, str]:
-        if problem := self._bridge.enough():
+        if problem := self._bridge.why_no_takeoff():
             return False, problem
         duration = seconds(request.duration)
         return self._each(names, lambda v: v.takeoff(request.height, duration), request.group_mask)
@@ -195,7 +200,7 @@ class Inputs:
     def _emergency(self, names: list[str], request: Any) -> tuple[bool, str]:
         for name in names:
             self._bridge.vehicles[name].stop("service emergency")
-        self._say("error", f"EMERGENCY STOP of {', '.join(names)}: service")
+        self._log("error", f"EMERGENCY STOP of {', '.join(names)}: service")
         return True, ""
 
     def _reconnect(self, name: str, request: Any, response: Any) -> Any:
@@ -211,10 +216,7 @@ class Inputs:
 
 # -- motion capture ---------------------------------------------------------------------------------------------------
 def named_pose_array() -> Any:
-    """Return the type of the named poses.
-
-    :raises ConfigError: its package is not in the workspace.
-    """
+    """Return the type of the named poses; ConfigError: its package is not in the workspace."""
     try:
         from motion_capture_tracking_interfaces.msg import NamedPoseArray
     except ImportError:
@@ -225,7 +227,9 @@ def named_pose_array() -> Any:
     return NamedPoseArray
 
 
-def subscribe_positions(poses: CommandThread, settings: PositionSettings, vehicles: dict[str, Vehicle]) -> None:
+def subscribe_positions(
+    poses: CommandThread, settings: PositionSettings, vehicles: dict[str, CrazyflieVehicle]
+) -> None:
     """Listen to motion capture, if there is one, in a thread that is not started yet.
 
     :raises ConfigError: the type of the named poses is not there.
@@ -239,20 +243,20 @@ def subscribe_positions(poses: CommandThread, settings: PositionSettings, vehicl
             poses.subscribe(PoseStamped, settings.topic_of(name), take, SENSOR)
 
 
-def _named(vehicles: dict[str, Vehicle], message: Any, info: Any) -> None:
+def _named(vehicles: dict[str, CrazyflieVehicle], message: Any, info: Any) -> None:
     for named in message.poses:
         if (vehicle := vehicles.get(named.name)) is not None:
             _see(vehicle, message.header, named.pose)
 
 
-def _see(vehicle: Vehicle, header: Any, pose: Any) -> None:
+def _see(vehicle: CrazyflieVehicle, header: Any, pose: Any) -> None:
     p, q = pose.position, pose.orientation
     stamp = header.stamp.sec + header.stamp.nanosec * 1e-9
-    vehicle.see((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), header.frame_id, stamp)
+    vehicle.receive_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), header.frame_id, stamp)
 
 
 # -- what goes out ----------------------------------------------------------------------------------------------------
-class Outputs:
+class BridgeOutputs:
     """Odometry, pose, status, diagnostics and events."""
 
     def __init__(self, node: Node, settings: SwarmSettings) -> None:
@@ -263,7 +267,7 @@ class Outputs:
         self._state: dict[str, Any] = {}
         self._status: dict[str, Any] = {}  # Crazyswarm2's, beside ours
         self._odom_message: dict[str, Odometry] = {}
-        self._wanted: dict[str, tuple[bool, bool]] = {}  # odometry, pose: does somebody listen?
+        self._wanted: dict[str, tuple[bool, bool]] = {}  # odometry, pose: is there a subscriber?
         self._counted: dict[str, tuple[int, int]] = {}
         self._critical = {robot.name: robot.battery.voltage_critical for robot in settings.robots}
         positions = settings.station.positions
@@ -279,10 +283,10 @@ class Outputs:
         self._events = node.create_publisher(Log, EVENTS.lstrip("/"), EVENTS_QOS)
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
 
-    def publish_state(self, vehicle: Vehicle, state: VehicleState) -> None:
-        """Odometry and pose of one log packet, in the link's thread; only what somebody listens to.
+    def publish_state(self, vehicle: CrazyflieVehicle, state: VehicleState) -> None:
+        """Odometry and pose of one log packet, in the link's thread, if there are subscribers.
 
-        Whoever has entered another state says so at once: others may fly towards it.
+        A new state is published at once: other vehicles may fly towards it.
         """
         name = vehicle.name
         if vehicle.state != self._reported.get(name):
@@ -309,12 +313,12 @@ class Outputs:
             self._pose[name].publish(PoseStamped(header=message.header, pose=message.pose.pose))
 
     def publish_event(self, level: str, line: str) -> None:
-        """One line of the log, for those who record a mission."""
+        """Publish one line of the log, for a mission's record."""
         stamp = self._clock.now().to_msg()
         self._events.publish(Log(stamp=stamp, level=LEVELS.get(level, 20), name=self._name, msg=line))
 
     def publish_status(self, snapshots: Sequence[Snapshot]) -> None:
-        """Status of all; also looks who listens to odometry and pose."""
+        """Publish the status of all; also count the subscribers of odometry and pose."""
         stamp = self._clock.now().to_msg()
         for s in snapshots:
             self._wanted[s.name] = (
@@ -387,7 +391,7 @@ def diagnostic(s: Snapshot, now: float) -> DiagnosticStatus:
     return DiagnosticStatus(level=level, name=name, message=s.state.name.lower(), hardware_id=s.name, values=pairs)
 
 
-def position_values(tracker: Tracker, now: float) -> dict[str, str]:
+def position_values(tracker: PoseTracker, now: float) -> dict[str, str]:
     """Return what /diagnostics says about motion capture and one vehicle."""
     refused = ", ".join(f"{kind} {number}" for kind, number in sorted(tracker.refused.items()))
     return {

@@ -40,19 +40,19 @@ BRIDGE_S = 60.0  # s, for the connections
 AGENTS_S = 60.0  # s, for their process
 
 
-class Mission:
+class GroundStation:
     """The ground station's part: it calls the bridge's services, watches the vehicles, and sends its heartbeat."""
 
     def __init__(
-        self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: StopToken, say: Callable[[str], None]
+        self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: StopToken, report: Callable[[str], None]
     ) -> None:
-        self.node, self.settings, self.scenario, self.ended, self.say = node, settings, scenario, ended, say
+        self.node, self.settings, self.scenario, self.ended, self.report = node, settings, scenario, ended, report
         self.status: dict[str, Status] = {}
         self.log = MissionLog()
         self.place: dict[str, tuple[float, float, float]] = {}
-        self.heard = time.monotonic()  # s, monotonic, the last status of anybody
+        self.last_status_time = time.monotonic()  # s, monotonic, the last status of anybody
         self.exchanging = False
-        self.bridge_alive: Callable[[], None] = lambda: None
+        self.check_bridge_process: Callable[[], None] = lambda: None
         self._odometry: list[Any] = []
         for robot in settings.robots:
             node.create_subscription(Status, f"/{robot.name}/{STATE}", self._keep_status(robot.name), 10)
@@ -84,7 +84,7 @@ class Mission:
     def _keep_status(self, name: str) -> Callable[[Status], None]:
         def keep(message: Status) -> None:
             self.status[name] = message
-            self.heard = time.monotonic()
+            self.last_status_time = time.monotonic()
             self.log.status(name, message)
             if self.exchanging and message.state != Status.STATE_FLYING and not self.ended.reason:
                 self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
@@ -106,11 +106,8 @@ class Mission:
                 self._stop_here.publish(EmptyMessage())
 
     def check_bridge(self) -> None:
-        """For a bridge that is not a child of this process.
-
-        :raises MissionError: nothing is heard of it.
-        """
-        silent = time.monotonic() - self.heard
+        """For a bridge that is not a child of this process; MissionError: nothing is heard of it."""
+        silent = time.monotonic() - self.last_status_time
         if self.status and silent > BRIDGE_SILENT_S:
             raise MissionError(f"the bridge has been silent for {silent:.1f} s")
 
@@ -126,15 +123,12 @@ class Mission:
         self._pulse.join(2.0)
 
     def call(self, name: str, timeout: float = 10.0, **fields: Any) -> Any:
-        """Call a service and wait for its answer (s, at most).
-
-        :raises MissionError: it does not answer or says no.
-        """
+        """Call a service and wait for its answer (s, at most); MissionError: it does not answer or says no."""
         client = self._clients[name]
         future = client.call_async(client.srv_type.Request(**fields))
         end = time.monotonic() + timeout
         while not future.done():
-            self.bridge_alive()
+            self.check_bridge_process()
             if time.monotonic() > end:
                 raise MissionError(f"service {name} does not answer")
             time.sleep(0.005)
@@ -144,13 +138,10 @@ class Mission:
         return response
 
     def wait(self, what: str, condition: Callable[[], bool], timeout: float) -> None:
-        """Wait until something is so (s, at most).
-
-        :raises MissionError: it takes too long, or the user interrupts.
-        """
+        """Wait until something is so (s, at most); MissionError: it takes too long, or the user interrupts."""
         end = time.monotonic() + timeout
         while not condition():
-            self.bridge_alive()
+            self.check_bridge_process()
             if self.ended:
                 raise MissionError(self.ended.reason or "interrupted")
             if time.monotonic() > end:
@@ -162,7 +153,7 @@ class Mission:
         return len(self.status) == len(self.settings.robots) and all(s.state in states for s in self.status.values())
 
     def connect(self) -> None:
-        """Bridge up, everybody ready, and it is known where each stands."""
+        """Wait until the bridge is up, all are ready, and it is known where each stands."""
         emergency = self._clients["/all/emergency"]
         self.wait("the bridge's start", emergency.service_is_ready, BRIDGE_S)
         self._beating.set()
@@ -176,10 +167,7 @@ class Mission:
         return self._all(Status.STATE_READY)
 
     def find_places(self, config: SwarmConfig) -> SwarmConfig:
-        """The configuration in which everybody begins near where it stands.
-
-        :raises MissionError: it is not safe to begin.
-        """
+        """Return the configuration in which all begin near where they stand; MissionError: it is not safe to begin."""
         vehicles = [robot.name for robot in self.settings.robots]
         measured = np.array([self.place[name] for name in vehicles]).T
         check_standing(vehicles, measured, self.settings.station.safety)
@@ -204,13 +192,13 @@ class Mission:
 
     def take_off(self) -> None:
         """Arm, climb to the middle of the room, go to the start."""
-        self.say("arming")
+        self.report("arming")
         self.call("/all/arm", arm=True)
         self.wait("arming", lambda: self._all(Status.STATE_ARMED), 5.0)
         height = self.settings.station.room_origin_in_world[2]
         limit = self.settings.station.max_speed_mps
         seconds = max(2.0, height / CLIMB_MPS, shortest_s(height, limit))
-        self.say("take-off")
+        self.report("take-off")
         self.call("/all/takeoff", height=height, duration=_duration(seconds))
         time.sleep(seconds)
         self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
@@ -240,7 +228,7 @@ class Mission:
 
     @property
     def flying(self) -> list[str]:
-        """Who was in the air, or may have been, when it was last heard of."""
+        """Names of those that were in the air, or may have been, by their last status."""
         return [name for name, s in sorted(self.status.items()) if s.state in IN_AIR]
 
     def at_rest(self, apart: Callable[[], bool]) -> bool:
@@ -265,15 +253,15 @@ class Mission:
         self.exchanging = False
         flying = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING)
         if any(s.state in flying for s in self.status.values()):
-            self.say("landing")
+            self.report("landing")
             self.order_landing()
             end = time.monotonic() + self.settings.station.landing_timeout_s
             while time.monotonic() < end and any(s.state in flying for s in self.status.values()):
-                if time.monotonic() - self.heard > BRIDGE_SILENT_S:
-                    self.say("the bridge is silent: what flies is left to its own watchdogs")
+                if time.monotonic() - self.last_status_time > BRIDGE_SILENT_S:
+                    self.report("the bridge is silent: what flies is left to its own watchdogs")
                     break
                 if urgent:
-                    self.say("EMERGENCY STOP")
+                    self.report("EMERGENCY STOP")
                     self._clients["/all/emergency"].call_async(Empty.Request())
                     time.sleep(0.5)
                     break

@@ -42,11 +42,11 @@ from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .ground_station import Mission
+from .ground_station import GroundStation
 from .mission_record import MISSION_BAG
 from .places import APART_M, MissionError, check_places
 
-RECORDER_END_S = 10.0
+RECORDER_END_S = 30.0  # it gives way to all others
 BRIDGE_END_S = 40.0  # s, to land by itself and close the links
 
 
@@ -57,11 +57,11 @@ class MissionWatch(ChannelObserver):
     come to rest. True once it is over; until then the agents avoid each other.
     """
 
-    def __init__(self, mission: Mission, channel: RealtimeChannel, metrics: FlightMetrics | None) -> None:
+    def __init__(self, mission: GroundStation, channel: RealtimeChannel, metrics: FlightMetrics | None) -> None:
         self._mission, self._channel, self._metrics = mission, channel, metrics
 
     def idle(self, status: ChannelStatus) -> None:
-        self._mission.bridge_alive()
+        self._mission.check_bridge_process()
         ended, metrics = self._mission.ended, self._metrics
         if metrics is not None and metrics.collided_pair and not ended.reason:
             a, b = metrics.collided_pair
@@ -78,14 +78,14 @@ class MissionWatch(ChannelObserver):
         return bool(gaps.min() >= APART_M)
 
 
-class _Station:
+class _MissionProcesses:
     """The processes of a mission, and the one order in which they end; `attach`: a bridge runs already, and goes on."""
 
     def __init__(self, settings: SwarmSettings, directory: Path, environment: dict[str, str], attach: bool) -> None:
         self.settings, self._directory, self._attach = settings, directory, attach
         self.context, self.progress = Context(), ProgressLine("fly")
         self.bridge, self.agents, self._recorder = (Children(directory / "log", environment) for _ in range(3))
-        self._mission: Mission | None = None
+        self._mission: GroundStation | None = None
 
     def start(self, swarm_yaml: Path) -> None:
         """Start the recorder, and the bridge unless there is one."""
@@ -96,7 +96,9 @@ class _Station:
             self.bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node",
                               ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
 
-    def take_off(self, run: RunConfig, scenario: Scenario, domain: int, ended: StopToken) -> tuple[RunConfig, Mission]:
+    def take_off(
+        self, run: RunConfig, scenario: Scenario, domain: int, ended: StopToken
+    ) -> tuple[RunConfig, GroundStation]:
         """Connect all vehicles, start the agents, and bring the vehicles into the air, at their places.
 
         Nothing of ours keeps the bridge waiting: it runs before all others, on a processor of its own, and what takes
@@ -107,8 +109,8 @@ class _Station:
         avoid_last_processor()
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
-        mission = self._mission = Mission(node, self.settings, scenario, ended, self.progress.show)
-        mission.bridge_alive = mission.check_bridge if self._attach else self.bridge.check
+        mission = self._mission = GroundStation(node, self.settings, scenario, ended, self.progress.show)
+        mission.check_bridge_process = mission.check_bridge if self._attach else self.bridge.check
         mission.start()
         set_realtime(below(self.settings.station.priority, 1))
         mission.connect()
@@ -124,12 +126,14 @@ class _Station:
 
     def _start_agents(self, run: RunConfig) -> None:
         settings, parameters = self.settings, self._directory / "parameters.yaml"
+        safety = settings.station.safety
         own = {
             "command_hz": float(max(robot.command_rate_hz for robot in settings.robots)),
             "priority": below(settings.station.priority, 2),
             "vehicles": " ".join(robot.name for robot in settings.robots),
             "origin": list(settings.station.room_origin_in_world),
-        }
+            "fence": safety.geofence, "fence_min": list(safety.geofence_min), "fence_max": list(safety.geofence_max),
+        }  # fmt: skip
         content = {"/**": {"ros__parameters": to_parameters(run.swarm.to_dict(), SwarmConfig) | own}}
         parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
         self.agents.start("agents", list(range(1, run.swarm.agents + 1)), "dtsa_agent.crazyflie.node.agents_node",
@@ -198,7 +202,7 @@ def fly_crazyflies(
         environment = run_environment(domain, directory / "log")
         if page is not None:
             shown.enter_context(view_process(domain, environment, page))
-        station, ended = _Station(settings, directory, environment, attach), StopToken(stop)
+        station, ended = _MissionProcesses(settings, directory, environment, attach), StopToken(stop)
         station.start(swarm_yaml)
         try:
             run, mission = station.take_off(run, scenario, domain, ended)
@@ -231,7 +235,12 @@ def below(priority: int, steps: int) -> int:
 
 
 def _exchange(
-    station: _Station, run: RunConfig, directory: Path, options: FlightOptions, ended: StopToken, mission: Mission
+    station: _MissionProcesses,
+    run: RunConfig,
+    directory: Path,
+    options: FlightOptions,
+    ended: StopToken,
+    mission: GroundStation,
 ) -> Flight:
     agents, progress = station.agents, station.progress
     node = Node("channel", namespace=names.SWARM, context=station.context)
@@ -259,7 +268,7 @@ def _exchange(
             if ended.stop.count > 1:
                 urgent.append(signal.SIGINT)
             if ended:
-                mission.order_landing()  # before the agents end: nobody flies on without them
+                mission.order_landing()  # before the agents end: no vehicle flies on without them
             agents.stop()
             mission.land(urgent)
         set_ordinary_thread()  # the bridge does not: it has to watch them

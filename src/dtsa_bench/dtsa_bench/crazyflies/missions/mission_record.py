@@ -19,14 +19,14 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from dtsa_msgs.msg import Status, VelocityWorld
+from dtsa_msgs.msg import Status
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS
+from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS, STATE, VelocityWorld
 from dtsa_agent.priority import set_nice
 from dtsa_agent.ros.common.node_process import follow_supervisor, init_ros
 from dtsa_bench.log.bag.writer import BagWriter
@@ -134,21 +134,20 @@ class RecordedTopic:
 
 def subscribe_topics(node: Any, bag: BagWriter, names: list[str]) -> list[RecordedTopic]:
     """Subscribe to everything that is recorded of these vehicles."""
-    wanted: list[tuple[type, str, str, QoSProfile]] = [
-        (Log, EVENTS, "rcl_interfaces/msg/Log", EVENTS_QOS),
-        (DiagnosticArray, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", ALL),
-    ]
+    recorded: list[tuple[Any, str, QoSProfile]] = [(Log, EVENTS, EVENTS_QOS), (DiagnosticArray, "/diagnostics", ALL)]
     for name in names:
-        wanted += [
-            (Status, f"/{name}/status", "dtsa_msgs/msg/Status", ALL),
-            (Odometry, f"/{name}/odom", "nav_msgs/msg/Odometry", LATEST),
-            (VelocityWorld, f"/{name}/cmd_velocity_world", "dtsa_msgs/msg/VelocityWorld", LATEST),
-            (PoseStamped, f"/{name}/pose", "geometry_msgs/msg/PoseStamped", LATEST),
+        recorded += [
+            (Status, f"/{name}/{STATE}", ALL),
+            (Odometry, f"/{name}/odom", LATEST),
+            (VelocityWorld, f"/{name}/cmd_velocity_world", LATEST),
+            (PoseStamped, f"/{name}/pose", LATEST),
         ]
     topics = []
-    for kind, topic, text, qos in wanted:
+    for kind, topic, qos in recorded:
         subscription = node.create_subscription(kind, topic, lambda message: None, qos)
-        topics.append(RecordedTopic(subscription.handle, kind, bag.add_topic(topic, text), qos.depth))
+        package, type_name = kind.__module__.partition(".")[0], kind.__name__
+        channel = bag.add_topic(topic, f"{package}/msg/{type_name}")
+        topics.append(RecordedTopic(subscription.handle, kind, channel, qos.depth))
     return topics
 
 

@@ -1,4 +1,4 @@
-"""Before motors turn: where each vehicle stands, measured, and who begins where."""
+"""Before motors turn: where each vehicle stands, measured, and where each agent begins."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from dtsa_agent.crazyflie.settings import SwarmSettings, parse_swarm
 
 PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
 MIN_RATE_HZ = 4  # of the log
-APART_M = 0.35  # m: closer than this to each other nobody takes off or flies to its start
+APART_M = 0.35  # m: closer than this to each other none takes off or flies to its start
 
 Array = NDArray[np.float64]
 
 
 class MissionError(DtsaError):
-    """The mission cannot go on; everybody is landed."""
+    """The mission cannot go on; all are landed."""
 
 
 def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[
 
 
 def check_places(settings: SwarmSettings, config: SwarmConfig) -> Scenario:
-    """The scenario, once it is sure that everybody stands where it begins.
+    """Return the scenario, once it is sure that all stand where they begin.
 
     :raises ConfigError: ids are missing, or vehicles' places are not where the scenario wants them: all of them.
     """
@@ -90,9 +90,9 @@ def example_swarm(count: int) -> str:
 
 
 def assign_places(config: SwarmConfig, measured: Array) -> SwarmConfig:
-    """The configuration in which everybody begins near where it stands, if roles may be exchanged.
+    """Return the configuration in which all begin near where they stand, if roles may be exchanged.
 
-    If somebody is not where it would begin, all exchange places: the sum of the squared ways is the smallest possible,
+    If one is not where it would begin, all exchange places: the sum of the squared ways is the smallest possible,
     with which ways that are flown at the same time keep 0.7 times the distance of the starts or goals. Roles that
     `places` gives are kept.
 
@@ -112,10 +112,7 @@ def assign_places(config: SwarmConfig, measured: Array) -> SwarmConfig:
 
 
 def check_standing(names: Sequence[str], measured: Array, fence: SafetySettings) -> None:
-    """Whether all can take off where they stand, (3, N), m, frame map.
-
-    :raises MissionError: with names and distances.
-    """
+    """Whether all can take off where they stand, (3, N), m, frame map; MissionError: with names and distances."""
     problems = []
     if fence.geofence:
         low, high = np.array(fence.geofence_min)[:2], np.array(fence.geofence_max)[:2]

@@ -12,7 +12,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 from dtsa_agent.yaml_file import read_yaml
 from dtsa_bench.crazyflies.simulated.fleet_config import start_positions
-from dtsa_bench.crazyflies.simulated.radio.esb import BITRATES
+from dtsa_bench.crazyflies.simulated.radio.air import BITRATES
 
 BUILT_IN = Path(__file__).parent / "apps"
 _KEYS = ("sources", "include", "flags", "parameters", "text")

@@ -27,10 +27,7 @@ class CompileError(DtsaError):
 
 
 def compiler() -> list[str]:
-    """The system's C compiler.
-
-    :raises ConfigError: there is none.
-    """
+    """The system's C compiler; ConfigError: there is none."""
     words = shlex.split(os.environ.get("CC", "")) or ["cc"]
     if shutil.which(words[0]) is None:
         raise ConfigError("CC", words[0], "a C compiler (Debian and Ubuntu: apt install gcc)")
@@ -65,10 +62,7 @@ def engine_library() -> Path:
 
 
 def compile_app(app: App, library: Path) -> str:
-    """Compile an app into a library; the compiler's warnings.
-
-    :raises CompileError: it does not compile.
-    """
+    """Compile an app into a library; the compiler's warnings; CompileError: it does not compile."""
     command = [*compiler(), *FLAGS, "-O1", "-DPEER_LAB", *app.flags]
     command += [f"-I{path}" for path in (*app.include, FIRMWARE)]
     # Its own names come first, whatever else of that name is loaded.

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_bench.crazyflies.simulated.crtp import LOG_TYPES, PARAM_TYPES, READ_ONLY, Entry
-from dtsa_bench.crazyflies.simulated.firmware import Setpoint
+from dtsa_bench.crazyflies.simulated.crtp import LOG_TYPES, PARAM_TYPES, READ_ONLY, VariableEntry
+from dtsa_bench.crazyflies.simulated.firmware import FirmwareSetpoint
 
 _PARAM_NAMES = {code: name for name, (code, _) in PARAM_TYPES.items()}
 _LOG_NAMES = {code: name for name, (code, _) in LOG_TYPES.items()}
@@ -23,13 +23,13 @@ _SETPOINT = struct.Struct("<9i13f")  # native/crazyflie.c
 _ABSOLUTE, _VELOCITY = 1, 2  # modes of an axis
 
 
-class Event(IntEnum):
+class EngineEvent(IntEnum):
     """What the engine tells (native/lab.h)."""
 
     NONE, SEND, HEARD, COMMAND, PRINT, APP_CHANNEL, ENDED, SPINS, ASSERT, MISUSE, RECORD = range(11)
 
 
-class Command(IntEnum):
+class AppCommand(IntEnum):
     """What an app asks for (native/lab.h)."""
 
     SETPOINT, RELAX, TAKEOFF, LAND, STOP, GO_TO, ARM, RECOVER, PARAMETER, DISABLE = range(10)
@@ -39,7 +39,7 @@ class AppError(DtsaError):
     """An app did what no app may do."""
 
 
-class _Told(Structure):
+class _Report(Structure):
     _fields_ = [
         ("kind", c_int32), ("vehicle", c_int32), ("code", c_int32), ("size", c_int32), ("time_ns", c_int64),
         ("other_ns", c_int64), ("answer", c_int32), ("data", c_uint8 * 1024),
@@ -48,12 +48,12 @@ class _Told(Structure):
 
 _SIGNATURES = {
     "lab_begin": (c_int, [c_int, c_int, POINTER(c_char_p), c_int, POINTER(c_char_p), c_int64, c_int64, c_int64]),
-    "lab_run": (POINTER(_Told), [c_int64]),
-    "lab_world": (POINTER(c_double), [c_int]),
-    "lab_known": (POINTER(c_double), [c_int]),
+    "lab_run": (POINTER(_Report), [c_int64]),
+    "lab_log_values": (POINTER(c_double), [c_int]),
+    "lab_parameter_values": (POINTER(c_double), [c_int]),
     "lab_off": (None, [c_int]),
     "lab_boot": (c_char_p, [c_int, c_char_p, c_int64, c_int64, c_int64, c_uint64, c_int, c_int]),
-    "lab_hear": (c_int, [c_int, c_int64, c_char_p, c_int, c_int]),
+    "lab_receive": (c_int, [c_int, c_int64, c_char_p, c_int, c_int]),
     "lab_app_channel": (c_int, [c_int, c_int64, c_char_p, c_int]),
     "lab_count": (c_int, [c_int, c_int]),
     "lab_name": (c_char_p, [c_int, c_int, c_int]),
@@ -64,14 +64,14 @@ _SIGNATURES = {
 }
 
 
-def decode_setpoint(data: bytes, t: float, yaw: float) -> tuple[int, Setpoint]:
+def decode_setpoint(data: bytes, t: float, yaw: float) -> tuple[int, FirmwareSetpoint]:
     """Priority and set-point that an app gave at t (s), with its heading (rad) then.
 
     Thrust and attitude alone mean level flight, or stopped motors without thrust: no more of them is simulated.
     """
     priority, x, _, z, _, _, yaw_mode, _, body, *values = _SETPOINT.unpack(data)
     place, speed, heading, rate = values[:3], values[3:6], values[8], values[11]
-    setpoint = Setpoint(t)
+    setpoint = FirmwareSetpoint(t)
     if yaw_mode == _ABSOLUTE:
         setpoint.yaw = math.radians(heading)
     elif yaw_mode == _VELOCITY:
@@ -122,21 +122,21 @@ class Engine:
             raise MemoryError
         self._run = self._library.lab_run
         #: Values of the firmware's log variables by vehicle, in the order of their names: written by the owner.
-        self.world: list[NDArray[np.float64]] = [
-            np.ctypeslib.as_array(self._library.lab_world(k), (len(names),)) for k in range(count)
+        self.firmware_logs: list[NDArray[np.float64]] = [
+            np.ctypeslib.as_array(self._library.lab_log_values(k), (len(names),)) for k in range(count)
         ]
         #: Values of the firmware's parameters by vehicle, likewise.
-        self.known: list[NDArray[np.float64]] = [
-            np.ctypeslib.as_array(self._library.lab_known(k), (len(parameters),)) for k in range(count)
+        self.firmware_parameters: list[NDArray[np.float64]] = [
+            np.ctypeslib.as_array(self._library.lab_parameter_values(k), (len(parameters),)) for k in range(count)
         ]
         self._variables: dict[tuple[int, int], dict[str, int]] = {}
-        self._told = _Told()
+        self._told = _Report()
 
     def close(self) -> None:
         """Switch all off."""
         self._library.lab_end()
 
-    def run(self, until_ns: int) -> _Told:
+    def run(self, until_ns: int) -> _Report:
         """Run the apps until a time, or until one asks or tells something: then `kind` is not NONE."""
         self._told = self._run(until_ns).contents
         return self._told
@@ -163,9 +163,9 @@ class Engine:
         self._variables.pop((vehicle, 0), None)
         self._variables.pop((vehicle, 1), None)
 
-    def hear(self, vehicle: int, now_ns: int, raw: bytes, rssi: int) -> bool:
+    def receive(self, vehicle: int, now_ns: int, raw: bytes, rssi: int) -> bool:
         """A packet (port, data) has come to a vehicle's processor; False: its queue is full."""
-        return bool(self._library.lab_hear(vehicle, now_ns, raw, len(raw), rssi))
+        return bool(self._library.lab_receive(vehicle, now_ns, raw, len(raw), rssi))
 
     def app_channel(self, vehicle: int, now_ns: int, data: bytes) -> bool:
         """A packet of the app channel has come to a vehicle; False: its queue is full."""
@@ -180,17 +180,11 @@ class Engine:
         return int(self._library.lab_type(vehicle, int(parameter), self._variables[vehicle, int(parameter)][name]))
 
     def get(self, vehicle: int, name: str, *, parameter: bool) -> float:
-        """Value of a parameter or a log variable of the app.
-
-        :raises KeyError: it has none of that name, or is switched off.
-        """
+        """Value of a parameter or a log variable of the app; KeyError: it has none of that name, or is switched off."""
         return float(self._library.lab_get(vehicle, int(parameter), self._variables[vehicle, int(parameter)][name]))
 
     def set(self, vehicle: int, now_ns: int, name: str, value: float) -> None:
-        """Set a parameter of the app.
-
-        :raises KeyError: it has none of that name, or is switched off.
-        """
+        """Set a parameter of the app; KeyError: it has none of that name, or is switched off."""
         self._library.lab_set(vehicle, now_ns, self._variables[vehicle, 1][name], value)
 
 
@@ -204,12 +198,12 @@ class AppVariables:
         self.parameters = [self._entry(name, True) for name in engine.names(vehicle, parameters=True)]
         self.logs = [self._entry(name, False) for name in engine.names(vehicle, parameters=False)]
 
-    def _entry(self, name: str, parameter: bool) -> Entry:
+    def _entry(self, name: str, parameter: bool) -> VariableEntry:
         group, _, rest = name.partition(".")
         code = self._engine.type(self._vehicle, name, parameter=parameter)
         text = (_PARAM_NAMES if parameter else _LOG_NAMES)[code & 15]
         value = self.parameter(name) if parameter else 0.0
-        return Entry(group, rest, text, value, read_only=parameter and bool(code & READ_ONLY))
+        return VariableEntry(group, rest, text, value, read_only=parameter and bool(code & READ_ONLY))
 
     def parameter(self, name: str) -> float:
         """Value of one of its parameters."""

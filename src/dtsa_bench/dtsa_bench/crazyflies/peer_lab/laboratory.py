@@ -18,21 +18,20 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.simulated.crtp import LOG_ENTRIES, PARAM_ENTRIES
 from dtsa_bench.crazyflies.simulated.estimate import log_values
 from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
-from dtsa_bench.crazyflies.simulated.peer import Peer
+from dtsa_bench.crazyflies.simulated.motion import TICK_S, FleetMotion
+from dtsa_bench.crazyflies.simulated.peer import CrtpPeer
 from dtsa_bench.crazyflies.simulated.planner import DISABLED, FLYING, IDLE, LANDING
-from dtsa_bench.crazyflies.simulated.radio import esb
-from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir
+from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, RATE_NAMES, TURN_NS, Agenda, RadioAir
 from dtsa_bench.crazyflies.simulated.truth import TruthLog
-from dtsa_bench.crazyflies.simulated.world import TICK_S, World
 from dtsa_channel_sim.model.air import Lines
 from dtsa_channel_sim.model.airtime import HEADER_BYTES, airtime_of
 from dtsa_channel_sim.model.medium import Mask, OnAir
 
 from .app import App, LabSettings
 from .compiling import compile_app, engine_library
-from .engine import AppError, AppVariables, Command, Engine, Event, decode_setpoint
+from .engine import AppCommand, AppError, AppVariables, Engine, EngineEvent, decode_setpoint
 from .polling import Polling
-from .record import Observer, Packet, Record
+from .record import Observer, PeerPacket, Record
 
 TICK_NS = round(TICK_S * 1e9)
 ADDRESS = 0xE7E7E7E700  # of the radios, but for their last byte, which is the id
@@ -60,7 +59,7 @@ class Laboratory:
         self.app = app
         self.now_ns = 0
         count = settings.agents
-        airtime = airtime_of("crazyflie", esb.BITRATES[settings.rate], esb.TURN_NS, 0)
+        airtime = airtime_of("crazyflie", BITRATES[settings.rate], TURN_NS, 0)
         line = airtime.line
         self._directory = tempfile.TemporaryDirectory(prefix="dtsa-peer-lab-")
         self._library = Path(self._directory.name) / "app.so"
@@ -77,19 +76,19 @@ class Laboratory:
         )
         header = {"count": count, "seed": settings.seed, "start": np.asarray(config.start).tolist()}
         self._truth = TruthLog(out / "truth.jsonl" if out else None, header)
-        self.world = World(config, self._report)
-        self.peers = [Peer(*both) for both in zip(self.world.firmware, self.world.estimates, strict=True)]
+        self.motion = FleetMotion(config, self._report)
+        self.peers = [CrtpPeer(*both) for both in zip(self.motion.firmware, self.motion.estimates, strict=True)]
         streams = np.random.SeedSequence(settings.seed).spawn(2)
         self._open_air(int(streams[0].generate_state(1)[0]))
         self._lines = Lines(airtime, count)
         self.overflows = [0] * count  # receptions that found a radio's queue full
-        self._handed: list[deque[Packet]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
+        self._handed: list[deque[PeerPacket]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
         #: What an app sends to the ground: s, id, packet of the app channel.
         self.from_apps: list[tuple[float, int, bytes]] = []
         self._on = [False] * count
-        self._lives = [0] * count  # how often each was switched off
+        self._power_cycles = [0] * count  # how often each was switched off
         self._parameters: list[dict[str, float]] = [dict(app.parameters) for _ in range(count)]
-        self.polling = Polling(self.air, self.agenda, settings, self.polled) if settings.polls else None
+        self.polling = Polling(self.air, self.agenda, settings, self.receive_poll) if settings.polls else None
         generator = np.random.default_rng(streams[1])
         starts = (generator.random(count) * settings.boot_s * 1e9).astype(np.int64).tolist()
         drifts = np.rint(generator.uniform(-1.0, 1.0, count) * settings.drift_ppm * 1000).astype(np.int64)
@@ -139,10 +138,10 @@ class Laboratory:
         while True:
             due = self.agenda.next_ns
             target = until_ns if due is None else min(due, until_ns)
-            told = self._engine.run(target)
-            if told.kind != Event.NONE:
-                self.now_ns = told.time_ns
-                self._hear_app(told)
+            report = self._engine.run(target)
+            if report.kind != EngineEvent.NONE:
+                self.now_ns = report.time_ns
+                self._handle_event(report)
                 continue
             self.now_ns = target
             if due is None or due >= until_ns:
@@ -160,34 +159,34 @@ class Laboratory:
         }
 
     # -- what apps tell and ask -------------------------------------------------------------------------------------
-    def _hear_app(self, told: Any) -> None:
-        k, now, data = told.vehicle, told.time_ns, bytes(told.data[: told.size])
-        kind = Event(told.kind)
-        if kind is Event.SEND:
-            packet = Packet(k + 1, data, now)
+    def _handle_event(self, report: Any) -> None:
+        k, now, data = report.vehicle, report.time_ns, bytes(report.data[: report.size])
+        kind = EngineEvent(report.kind)
+        if kind is EngineEvent.SEND:
+            packet = PeerPacket(k + 1, data, now)
             self._notify("sent", k + 1, now, packet)
-            at_ns = told.other_ns
+            at_ns = report.other_ns
             self.agenda.at(at_ns, lambda: self._order_to_send(packet, at_ns))
-        elif kind is Event.HEARD:
+        elif kind is EngineEvent.HEARD:
             packet = self._handed[k].popleft()
-            if told.code >= 0:
+            if report.code >= 0:
                 self._notify("heard", k + 1, now, packet)
-        elif kind is Event.COMMAND:
-            told.answer = self._command(k, Command(told.code), data)
-            self._notify("command", k + 1, now, (told.code, data))
-            self.show(k)
-        elif kind is Event.PRINT:
+        elif kind is EngineEvent.COMMAND:
+            report.answer = self._command(k, AppCommand(report.code), data)
+            self._notify("command", k + 1, now, (report.code, data))
+            self.update_app(k)
+        elif kind is EngineEvent.PRINT:
             self._notify("print", k + 1, now, data.decode("utf-8", "replace"))
-        elif kind is Event.RECORD:
+        elif kind is EngineEvent.RECORD:
             self._notify("record", k + 1, now, data)
-        elif kind is Event.APP_CHANNEL:
+        elif kind is EngineEvent.APP_CHANNEL:
             self.from_apps.append((now / 1e9, k + 1, data))
             self._notify("app_channel", k + 1, now, data)
-        elif kind is not Event.ENDED:
+        elif kind is not EngineEvent.ENDED:
             text = data.decode("utf-8", "replace")
             reason = {
-                Event.SPINS: f"task {text} has not waited for {self.settings.spin_ms:g} ms: it never yields",
-                Event.ASSERT: f"assertion failed in {text}",
+                EngineEvent.SPINS: f"task {text} has not waited for {self.settings.spin_ms:g} ms: it never yields",
+                EngineEvent.ASSERT: f"assertion failed in {text}",
             }.get(kind, f"it used {text}")
             raise AppError(f"app of agent {k + 1} at {now / 1e9:.6f} s: {reason}")
 
@@ -195,112 +194,112 @@ class Laboratory:
         for observer in self._observers:
             observer(kind, agent, now_ns, content)
 
-    def _command(self, k: int, command: Command, data: bytes) -> int:
-        firmware, t = self.world.firmware[k], self.time
-        if command is Command.SETPOINT:
+    def _command(self, k: int, command: AppCommand, data: bytes) -> int:
+        firmware, t = self.motion.firmware[k], self.time
+        if command is AppCommand.SETPOINT:
             priority, setpoint = decode_setpoint(data, t, firmware.yaw)
             self.record.setpoints += 1
             firmware.offer(setpoint, priority)
             return 0
-        if command is Command.RELAX:
+        if command is AppCommand.RELAX:
             firmware.notify_stop()
             return 0
-        if command is Command.DISABLE:
+        if command is AppCommand.DISABLE:
             firmware.planner.disable()
             return 0
-        if command is Command.STOP:
+        if command is AppCommand.STOP:
             return firmware.high_level(bytes((3, 0)), t)
         values = struct.unpack(f"<{len(data) // 4}f", data)
-        if command is Command.GO_TO:
+        if command is AppCommand.GO_TO:
             return self._go_to(k, values[:3], values[3], values[4], bool(values[5]))
-        if command is Command.ARM:
+        if command is AppCommand.ARM:
             return int(firmware.supervisor.request_arming(bool(values[0])))
-        if command is Command.RECOVER:
+        if command is AppCommand.RECOVER:
             return int(firmware.supervisor.request_recovery())
-        if command is Command.PARAMETER:
+        if command is AppCommand.PARAMETER:
             self.peers[k].set_parameter(round(values[0]), values[1], t)
             return 0
         height, duration, yaw, keep = values
-        return self._rise(k, command is Command.TAKEOFF, height, duration, yaw, bool(keep))
+        return self._rise(k, command is AppCommand.TAKEOFF, height, duration, yaw, bool(keep))
 
     def _rise(self, k: int, up: bool, height: float, duration: float, yaw: float = 0.0, keep: bool = True) -> int:
         packet = struct.pack("<BBff?f", 7 if up else 8, 0, height, yaw, keep, duration)
-        return self.world.firmware[k].high_level(packet, self.time)
+        return self.motion.firmware[k].high_level(packet, self.time)
 
     def _go_to(self, k: int, place: Any, yaw: float, duration: float, relative: bool) -> int:
         packet = struct.pack("<BB??5f", 12, 0, relative, False, *place, yaw, duration)
-        return self.world.firmware[k].high_level(packet, self.time)
+        return self.motion.firmware[k].high_level(packet, self.time)
 
     # -- world ------------------------------------------------------------------------------------------------------
     def _tick(self) -> None:
-        self.world.step((self.now_ns - TICK_NS) / 1e9)
-        position = self.world.vehicles.position
+        self.motion.step((self.now_ns - TICK_NS) / 1e9)
+        position = self.motion.vehicles.position
         self._notify("positions", 0, self.now_ns, position)
         self._truth.positions(self.time, position)
         for k, on in enumerate(self._on):
             if on:
-                self.show(k)
+                self.update_app(k)
         self.agenda.at(self.now_ns + TICK_NS, self._tick)
 
-    def show(self, k: int) -> None:
+    def update_app(self, k: int) -> None:
         """Tell a vehicle's app (by its index) what its firmware knows."""
-        firmware = self.world.firmware[k]
-        values = log_values(self.world.estimates[k], firmware, self.time)
+        firmware = self.motion.firmware[k]
+        values = log_values(self.motion.estimates[k], firmware, self.time)
         own = firmware.priority, _PLANNER[firmware.planner.state]
-        self._engine.world[k][:] = [*(values[name] for name in _NAMES), *own]
-        self._engine.known[k][:] = self.peers[k].values[: len(_KNOWN)]
+        self._engine.firmware_logs[k][:] = [*(values[name] for name in _NAMES), *own]
+        self._engine.firmware_parameters[k][:] = self.peers[k].values[: len(_KNOWN)]
 
     def _report(self, index: int, name: str, **details: Any) -> None:
         self._notify("event", index + 1, self.now_ns, name)
         self._truth.event(self.time, index + 1, name, **details)
 
     # -- air --------------------------------------------------------------------------------------------------------
-    def _order_to_send(self, packet: Packet, at_ns: int) -> None:
+    def _order_to_send(self, packet: PeerPacket, at_ns: int) -> None:
         """A packet has come over the line to a radio: it is sent as soon as the radio can."""
         length = len(packet.data)
         start_ns = self._lines.start_ns(packet.sender, at_ns, length)
         settings = self.settings
         sender = self._first + packet.sender - 1
         frame = self.air.send(settings.channel, settings.rate, sender, start_ns, HEADER_BYTES + length)
-        self.agenda.at(frame.end_ns, lambda: self._left(packet, frame))
+        self.agenda.at(frame.end_ns, lambda: self._resolve(packet, frame))
 
-    def _left(self, packet: Packet, frame: OnAir) -> None:
-        """A packet has left the air: who has it?"""
+    def _resolve(self, packet: PeerPacket, frame: OnAir) -> None:
+        """Find the receivers of a packet that has left the air."""
         self.record.on_air_ns += frame.end_ns - frame.air_ns
-        self.hear(packet, self.air.heard(self.settings.channel, frame), frame)
+        self.deliver_packet(packet, self.air.receivers_of(self.settings.channel, frame), frame)
 
-    def hear(self, packet: Packet, heard: set[int], frame: OnAir) -> None:
+    def deliver_packet(self, packet: PeerPacket, heard: set[int], frame: OnAir) -> None:
         """A packet has left the air; `heard` has the ids on the air of the radios that can decode it."""
         received = np.array([on and k in heard for k, on in enumerate(self._on, self._first)])
-        for agent in self._take_in(frame.end_ns, len(packet.data), received):
-            done_ns, life = self._lines.handed_ns(agent), self._lives[agent - 1]
+        for agent in self._hand_over(frame.end_ns, len(packet.data), received):
+            done_ns, life = self._lines.handed_ns(agent), self._power_cycles[agent - 1]
             self.agenda.at(done_ns, lambda agent=agent, at=done_ns, life=life: self._deliver(agent, at, packet, life))  # type: ignore[misc]
 
-    def _take_in(self, now_ns: int, length: int, received: Mask) -> list[int]:
+    def _hand_over(self, now_ns: int, length: int, received: Mask) -> list[int]:
         """Radios that have received something hand it over, if their queues have room; the ids of these."""
         taken, _ = self._lines.receive(now_ns, length, received)
         for k in np.flatnonzero(received & ~taken).tolist():
             self.overflows[k] += 1
         return [int(k) + 1 for k in np.flatnonzero(taken)]
 
-    def polled(self, agent: int, t: float) -> None:
+    def receive_poll(self, agent: int, t: float) -> None:
         """A packet of a ground station has come to a radio, at t (s)."""
         received = np.zeros(self.settings.agents, dtype=np.bool_)
         received[agent - 1] = self._on[agent - 1]
-        self._take_in(round(t * 1e9), 0, received)
+        self._hand_over(round(t * 1e9), 0, received)
 
-    def _deliver(self, agent: int, now_ns: int, packet: Packet, life: int) -> None:
+    def _deliver(self, agent: int, now_ns: int, packet: PeerPacket, life: int) -> None:
         k = agent - 1
-        if life != self._lives[k]:
+        if life != self._power_cycles[k]:
             return  # its power was off meanwhile
-        if self._engine.hear(k, now_ns, packet.raw, self._rssi(packet.sender, k)):
+        if self._engine.receive(k, now_ns, packet.raw, self._rssi(packet.sender, k)):
             self._handed[k].append(packet)
 
     def _rssi(self, sender: int, k: int) -> int:
         """Strength of a reception, in -dBm: by the distance, without fading."""
         if not sender:
             return _FOREIGN_RSSI
-        position = self.world.vehicles.position
+        position = self.motion.vehicles.position
         distance = max(_NEAREST_M, float(np.linalg.norm(position[:, sender - 1] - position[:, k])))
         return round(_NEAR_RSSI + 20.0 * math.log10(distance))
 
@@ -322,8 +321,8 @@ class Laboratory:
         self._copies += 1
         # What is loaded from a copy of its own has variables of its own.
         copy = Path(shutil.copyfile(self._library, Path(self._directory.name) / f"agent_{agent}_{self._copies}.so"))
-        self.show(k)
-        speed = esb.RATE_NAMES.index(self.settings.rate)
+        self.update_app(k)
+        speed = RATE_NAMES.index(self.settings.rate)
         self._engine.boot(k, copy, self.now_ns, self._drifts[k], ADDRESS + agent, self.settings.channel, speed)
         copy.unlink()
         self._on[k] = True
@@ -338,10 +337,10 @@ class Laboratory:
         if self._on[k]:
             self._on[k] = False
             self._engine.off(k)
-            self._lives[k] += 1
+            self._power_cycles[k] += 1
             self._lines.reset(agent)
             self._handed[k].clear()
-            self.world.firmware[k].reset()
+            self.motion.firmware[k].reset()
             self.peers[k].reset()
 
     def set_parameter(self, agent: int, name: str, value: float) -> None:
@@ -353,7 +352,7 @@ class Laboratory:
         k = self._index(agent)
         self._parameters[k][name] = value
         if self._on[k]:
-            self._known(k, name, parameters=True)
+            self._check_name(k, name, parameters=True)
             self._engine.set(k, self.now_ns, name, value)
 
     def parameter(self, agent: int, name: str) -> float:
@@ -362,7 +361,7 @@ class Laboratory:
         :raises ConfigError: the app has none of that name, or is switched off.
         """
         k = self._index(agent)
-        self._known(k, name, parameters=True)
+        self._check_name(k, name, parameters=True)
         return self._engine.get(k, name, parameter=True)
 
     def log(self, agent: int, name: str) -> float:
@@ -372,8 +371,8 @@ class Laboratory:
         """
         k = self._index(agent)
         if name in _NAMES:
-            return float(self._engine.world[k][_NAMES.index(name)])
-        self._known(k, name, parameters=False)
+            return float(self._engine.firmware_logs[k][_NAMES.index(name)])
+        self._check_name(k, name, parameters=False)
         return self._engine.get(k, name, parameter=False)
 
     def logs(self, agent: int) -> Mapping[str, float]:
@@ -381,7 +380,7 @@ class Laboratory:
         k = self._index(agent)
         return {name: self._engine.get(k, name, parameter=False) for name in self._engine.names(k, parameters=False)}
 
-    def _known(self, k: int, name: str, *, parameters: bool) -> None:
+    def _check_name(self, k: int, name: str, *, parameters: bool) -> None:
         names = self._engine.names(k, parameters=parameters)
         if name not in names:
             what = "parameter" if parameters else "log variable"
@@ -398,14 +397,14 @@ class Laboratory:
         return not self._on[k] or self._engine.app_channel(k, self.now_ns, data)
 
     def transmit(self, data: bytes, port: int = 0) -> None:
-        """A foreign radio on the channel sends a peer-to-peer packet now, whoever else does.
+        """A foreign radio on the channel sends a peer-to-peer packet now, whatever else is on the air.
 
         :param data: at most 60 bytes.
         """
-        packet, settings = Packet(0, bytes((port,)) + data, self.now_ns), self.settings
+        packet, settings = PeerPacket(0, bytes((port,)) + data, self.now_ns), self.settings
         radio = settings.agents + 2
         frame = self.air.send(settings.channel, settings.rate, radio, self.now_ns, HEADER_BYTES + len(data))
-        self.agenda.at(frame.end_ns, lambda: self._left(packet, frame))
+        self.agenda.at(frame.end_ns, lambda: self._resolve(packet, frame))
 
     def set_loss(self, loss: float) -> None:
         """From now on receivers lose another share of frames."""
@@ -413,25 +412,25 @@ class Laboratory:
 
     def arm(self, agent: int, arm: bool = True) -> bool:
         """Arm or disarm; False: the firmware refuses."""
-        return self._then_show(agent, self.world.firmware[self._index(agent)].supervisor.request_arming(arm))
+        return self._then_update(agent, self.motion.firmware[self._index(agent)].supervisor.request_arming(arm))
 
     def take_off(self, agent: int, height: float, duration: float) -> bool:
         """High-level take-off (m, s); False: the firmware refuses."""
-        return self._then_show(agent, self._rise(self._index(agent), True, height, duration) == 0)
+        return self._then_update(agent, self._rise(self._index(agent), True, height, duration) == 0)
 
     def land(self, agent: int, height: float, duration: float) -> bool:
         """High-level landing (m, s); False: the firmware refuses."""
-        self.world.firmware[self._index(agent)].notify_stop()
-        return self._then_show(agent, self._rise(self._index(agent), False, height, duration) == 0)
+        self.motion.firmware[self._index(agent)].notify_stop()
+        return self._then_update(agent, self._rise(self._index(agent), False, height, duration) == 0)
 
     def go_to(self, agent: int, x: float, y: float, z: float, duration: float) -> bool:
         """High-level flight to a place (m, s); False: the firmware refuses."""
-        return self._then_show(agent, self._go_to(self._index(agent), (x, y, z), 0.0, duration, False) == 0)
+        return self._then_update(agent, self._go_to(self._index(agent), (x, y, z), 0.0, duration, False) == 0)
 
     def emergency(self, agent: int) -> None:
         """Emergency stop: latches until it is switched off and on."""
-        self.world.firmware[self._index(agent)].supervisor.stop("emergency stop")
+        self.motion.firmware[self._index(agent)].supervisor.stop("emergency stop")
 
-    def _then_show(self, agent: int, done: bool) -> bool:
-        self.show(agent - 1)
+    def _then_update(self, agent: int, done: bool) -> bool:
+        self.update_app(agent - 1)
         return done

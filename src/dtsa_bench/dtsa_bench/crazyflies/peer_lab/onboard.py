@@ -15,7 +15,7 @@ from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.onboard import KEY_BYTES, PORT, START, check_on_board, orders, parameters
+from dtsa_agent.crazyflie.onboard import KEY_BYTES, PORT, START, app_orders, app_parameters, check_onboard_swarm
 from dtsa_bench.log.agent_bag import AgentRecorder
 
 from .app import App, LabSettings, read_app
@@ -29,7 +29,7 @@ HEIGHT_M = 1.2  # of the frame map above the floor
 _UP = np.array([[0.0], [0.0], [HEIGHT_M]])
 
 
-class _P2P:
+class _PeerPort:
     """The port of a Crazyflie, for the bag."""
 
     properties, where = PORT, "peer to peer"
@@ -39,11 +39,11 @@ class _P2P:
         return {}
 
 
-class _Flight:
+class _AgentFlight:
     """What one agent has noted, and its bag."""
 
     def __init__(self, agent: int, config: SwarmConfig, path: Path) -> None:
-        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _P2P(), not config.targets_known)
+        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _PeerPort(), not config.targets_known)
         self._record: SlotRecord | None = None
         self._before: list[ReceivedFrame] = []
         self._slots = config.steps
@@ -89,7 +89,7 @@ class _Flight:
         self._recorder.__exit__()
 
 
-class OnBoard:
+class OnboardSwarm:
     """A swarm that flies the protocol on board, and its ground.
 
     :param swarm: what all agents share; the app has the defaults of the rest.
@@ -110,7 +110,7 @@ class OnBoard:
         enable_s: float | None = 8.0,
         flags: Sequence[str] = (),
     ) -> None:
-        check_on_board(swarm)
+        check_onboard_swarm(swarm)
         if swarm.auth and len(key) != KEY_BYTES:
             raise ConfigError("key", len(key) or "none", f"{KEY_BYTES} bytes on board")
         self.swarm, self.scenario = swarm, make_scenario(swarm)
@@ -121,7 +121,7 @@ class OnBoard:
         app = dataclasses.replace(app, flags=(*app.flags, *flags))
         self.lab = self._make_laboratory(app, settings, out)
         self._flights = [
-            None if out is None else _Flight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
+            None if out is None else _AgentFlight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
         ]
         self._key = key
         if enable_s is None:
@@ -141,15 +141,15 @@ class OnBoard:
         self._at(enable_s, self.lab.set_parameter, agent, "dtsa.enable", 1)
 
     def prepare(self, agent: int) -> None:
-        """Tell one that has just been switched on its settings and everybody's places, and start it."""
+        """Send an agent that has just been switched on its settings and all places, and start it."""
         lab, now = self.lab, self.lab.time
-        for name, value in parameters(self.swarm, self.scenario, HEIGHT_M).items():
+        for name, value in app_parameters(self.swarm, self.scenario, HEIGHT_M).items():
             lab.set_parameter(agent, name, value)
-        for i, order in enumerate([*orders(self.swarm, self.scenario, self._key), START]):
+        for i, order in enumerate([*app_orders(self.swarm, self.scenario, self._key), START]):
             self._at(now + 0.1 + i * _ORDER_S, lab.send, agent, order)
 
     def come_back(self, agent: int, after_s: float) -> None:
-        """One that was switched off is switched on, told all, and takes off; it may steer so many s from now on."""
+        """Switch one on that was off; it gets its settings and takes off, and may steer so many s from now on."""
         self.lab.switch_on(agent)
         self._at(self.lab.time + 0.5, self.prepare, agent)
         self._climb(agent, HEIGHT_M, self.lab.time + after_s)
@@ -167,7 +167,7 @@ class OnBoard:
         if kind == "record" and (flight := self._flights[agent - 1]) is not None:
             flight.note(content)
 
-    def __enter__(self) -> OnBoard:
+    def __enter__(self) -> OnboardSwarm:
         return self
 
     def __exit__(self, *unused: object) -> None:
@@ -176,7 +176,7 @@ class OnBoard:
     def finish(self) -> dict[str, Any]:
         """The flight is over: bags are closed; what came of it."""
         goal = np.array(self.scenario.target) + _UP
-        away = np.sqrt(((goal - self.lab.world.vehicles.position) ** 2).sum(axis=0))
+        away = np.sqrt(((goal - self.lab.motion.vehicles.position) ** 2).sum(axis=0))
         summary = {**self.lab.summary(), "away_m": [round(float(x), 3) for x in away]}
         for flight in self._flights:
             if flight is not None:

@@ -7,11 +7,10 @@ from functools import partial
 
 import numpy as np
 
-from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir
-from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, Dongle
-from dtsa_bench.crazyflies.simulated.radio.esb import RATE_NAMES
-from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, Receiver
-from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
+from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
+from dtsa_bench.crazyflies.simulated.radio.air import RATE_NAMES, Agenda, RadioAir
+from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, DongleModel
+from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, RadioReceiver
 
 from .app import LabSettings
 
@@ -29,15 +28,16 @@ class Polling:
         self.answered = 0
         self._agenda = agenda
         self._stations = [
-            Station("", settings.channel, settings.rate, bytes((0xE7, 0xE7, 0xE7, 0xE7, k + 1))) for k in range(count)
+            RadioAddress("", settings.channel, settings.rate, bytes((0xE7, 0xE7, 0xE7, 0xE7, k + 1)))
+            for k in range(count)
         ]
         receivers = {
-            agent: Receiver(station, lambda packet, t: None) for agent, station in enumerate(self._stations, 1)
+            agent: RadioReceiver(station, lambda packet, t: None) for agent, station in enumerate(self._stations, 1)
         }
         for agent, receiver in receivers.items():
-            receiver.taken = partial(taken, agent)
+            receiver.on_packet = partial(taken, agent)
         radio = RadioSettings(seed=settings.seed, request_ms=0.0)
-        self._dongle = Dongle(count + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
+        self._dongle = DongleModel(count + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
         self._dongle.request(SET_CHANNEL, settings.channel, 0, b"", 0)
         self._dongle.request(SET_RATE, RATE_NAMES.index(settings.rate), 0, b"", 0)
         self._gap_ns = round(1e9 / (settings.polls * count))

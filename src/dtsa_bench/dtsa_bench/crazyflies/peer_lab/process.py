@@ -78,9 +78,9 @@ def _fly(
         lab = Laboratory(app, settings, out)
         finish = lab.summary
     else:
-        from .onboard import OnBoard  # the log: others do without
+        from .onboard import OnboardSwarm  # the log: others do without
 
-        flight = OnBoard(swarm, settings, out, key_of(swarm), flags=flags)
+        flight = OnboardSwarm(swarm, settings, out, key_of(swarm), flags=flags)
         lab, finish = flight.lab, flight.finish
     with lab:
         for name, value in parameters.items():

@@ -17,7 +17,7 @@ _FLYING_M = 0.05  # higher than that it is in the air
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class PeerPacket:
     """A peer-to-peer packet on its way."""
 
     sender: int  # id; 0: a foreign one
@@ -30,7 +30,7 @@ class Packet:
         return self.raw[1:]
 
 
-class Ages:
+class StateAges:
     """How old what each vehicle knows of each other one is, from the first packet that it heard of it on."""
 
     def __init__(self, agents: int) -> None:
@@ -41,7 +41,7 @@ class Ages:
         self._area = np.zeros(shape)  # ms s
         self._worst = np.zeros(shape, dtype=np.int64)
 
-    def heard(self, receiver: int, sender: int, stamp_ns: int, now_ns: int) -> None:
+    def add_state(self, receiver: int, sender: int, stamp_ns: int, now_ns: int) -> None:
         """A state of a sender (id) has come to a receiver (id)."""
         pair = receiver - 1, sender - 1
         if stamp_ns <= self._stamp[pair]:
@@ -83,7 +83,7 @@ class Record:
     """Counts, ages, distances, and the digest of all of it; with a directory, a file of all packets."""
 
     def __init__(self, agents: int, carries_state: Callable[[bytes, int], bool], directory: Path | None = None) -> None:
-        self._carries_state, self._ages, self._digest = carries_state, Ages(agents), hashlib.sha256()
+        self._carries_state, self._ages, self._digest = carries_state, StateAges(agents), hashlib.sha256()
         self.agents = agents
         self.sent, self.heard = [0] * agents, [0] * agents
         self.setpoints = 0
@@ -108,17 +108,17 @@ class Record:
         if self._file is not None:
             self._file.write(json.dumps(entry) + "\n")
 
-    def _note_sent(self, agent: int, now_ns: int, packet: Packet) -> None:
+    def _note_sent(self, agent: int, now_ns: int, packet: PeerPacket) -> None:
         self.sent[agent - 1] += 1
         self._digest_update(0, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, sent=agent, port=packet.raw[0], data=packet.data.hex())
 
-    def _note_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
+    def _note_heard(self, agent: int, now_ns: int, packet: PeerPacket) -> None:
         self.heard[agent - 1] += 1
         self._digest_update(1, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, heard=agent, sender=packet.sender, port=packet.raw[0], data=packet.data.hex())
         if packet.sender and self._carries_state(packet.data, agent):
-            self._ages.heard(agent, packet.sender, packet.ordered_ns, now_ns)
+            self._ages.add_state(agent, packet.sender, packet.ordered_ns, now_ns)
 
     def _note_command(self, agent: int, now_ns: int, command: tuple[int, bytes]) -> None:
         self._digest_update(2 + command[0], agent, now_ns, command[1])

@@ -14,8 +14,8 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.priority import set_realtime
-from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
-from dtsa_bench.crazyflies.simulated.radio.side import Dongles
+from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
+from dtsa_bench.crazyflies.simulated.radio.side import DongleServer
 from dtsa_bench.runs.options import add_options, given_options, whole_number
 
 from .fleet import NUMBERS, Fleet
@@ -93,7 +93,7 @@ def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
     start = np.array([robot.initial_position for robot in robots]).T
     radio: RadioSettings = options["radio"]
     if radio.path is not None:
-        radio = dataclasses.replace(radio, stations=tuple(Station.of(robot.uri) for robot in robots))
+        radio = dataclasses.replace(radio, stations=tuple(RadioAddress.of(robot.uri) for robot in robots))
         return FleetConfig(**{**options, "count": len(robots), "start": start, "radio": radio})
     ports = []
     for robot in robots:
@@ -108,10 +108,7 @@ def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
 
 
 def request_fault(args: argparse.Namespace) -> None:
-    """Send a fault to a running fleet.
-
-    :raises ConfigError: nobody listens, or it was refused.
-    """
+    """Send a fault to a running fleet; ConfigError: no fleet listens, or it was refused."""
     cf: object = args.cf
     if args.cf != "all":
         try:
@@ -176,7 +173,7 @@ def _run_dongles(args: argparse.Namespace, priority: int) -> int:
     if args.simulated_radio is None or args.config is not None:
         raise ConfigError("dongles_only", True, "with --simulated-radio SOCKET, and without --config")
     settings = RadioSettings(**given_options(args, RadioSettings, "radio"), path=args.simulated_radio)
-    dongles = Dongles(settings)
+    dongles = DongleServer(settings)
     set_realtime(priority)
     _end_by_signals(dongles.stop, args.ignore_interrupt)
     print(f"{settings.dongles} simulated Crazyradios at {settings.path}; Ctrl-C ends", flush=True)

@@ -73,7 +73,7 @@ LOG_LIMITS["i"] = (-(2**31), 2**31 - 1)
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class VariableEntry:
     """One variable or parameter."""
 
     group: str
@@ -88,11 +88,11 @@ class Entry:
         return f"{self.group}.{self.name}"
 
 
-def _log(group: str, type_name: str, *names: str) -> list[Entry]:
-    return [Entry(group, name, type_name) for name in names]
+def _log(group: str, type_name: str, *names: str) -> list[VariableEntry]:
+    return [VariableEntry(group, name, type_name) for name in names]
 
 
-LOG_ENTRIES: tuple[Entry, ...] = (
+LOG_ENTRIES: tuple[VariableEntry, ...] = (
     *_log("stateEstimateZ", "int16_t", "x", "y", "z", "vx", "vy", "vz"),
     *_log("stateEstimateZ", "uint32_t", "quat"),
     *_log("stateEstimateZ", "int16_t", "rateRoll", "ratePitch", "rateYaw"),
@@ -107,42 +107,42 @@ LOG_ENTRIES: tuple[Entry, ...] = (
     *_log("radio", "uint8_t", "rssi"),
 )
 
-PARAM_ENTRIES: tuple[Entry, ...] = (
-    Entry("kalman", "resetEstimation", "uint8_t", 0),
-    Entry("kalman", "initialX", "float", 0.0),
-    Entry("kalman", "initialY", "float", 0.0),
-    Entry("kalman", "initialZ", "float", 0.0),
-    Entry("locSrv", "extPosStdDev", "float", 0.01),
-    Entry("locSrv", "extQuatStdDev", "float", 4.5e-3),
-    Entry("stabilizer", "estimator", "uint8_t", 2),
-    Entry("stabilizer", "controller", "uint8_t", 1),
-    Entry("stabilizer", "stop", "uint8_t", 0),
-    Entry("commander", "enHighLevel", "uint8_t", 1),
-    Entry("hlCommander", "vtoff", "float", 0.5),
-    Entry("hlCommander", "vland", "float", 0.5),
-    Entry("hlCommander", "groupmask", "uint8_t", 0),
-    Entry("posCtlPid", "xVelMax", "float", 1.0),
-    Entry("posCtlPid", "yVelMax", "float", 1.0),
-    Entry("posCtlPid", "zVelMax", "float", 1.0),
-    Entry("ring", "effect", "uint8_t", 6),
-    Entry("led", "bitmask", "uint8_t", 0),
-    Entry("usd", "logging", "uint8_t", 0),
-    Entry("colAv", "enable", "uint8_t", 0),
-    Entry("firmware", "revision0", "uint32_t", 0xD75A0001, read_only=True),
-    Entry("firmware", "modified", "uint8_t", 0, read_only=True),
-    Entry("deck", "bcLighthouse4", "uint8_t", 1, read_only=True),
+PARAM_ENTRIES: tuple[VariableEntry, ...] = (
+    VariableEntry("kalman", "resetEstimation", "uint8_t", 0),
+    VariableEntry("kalman", "initialX", "float", 0.0),
+    VariableEntry("kalman", "initialY", "float", 0.0),
+    VariableEntry("kalman", "initialZ", "float", 0.0),
+    VariableEntry("locSrv", "extPosStdDev", "float", 0.01),
+    VariableEntry("locSrv", "extQuatStdDev", "float", 4.5e-3),
+    VariableEntry("stabilizer", "estimator", "uint8_t", 2),
+    VariableEntry("stabilizer", "controller", "uint8_t", 1),
+    VariableEntry("stabilizer", "stop", "uint8_t", 0),
+    VariableEntry("commander", "enHighLevel", "uint8_t", 1),
+    VariableEntry("hlCommander", "vtoff", "float", 0.5),
+    VariableEntry("hlCommander", "vland", "float", 0.5),
+    VariableEntry("hlCommander", "groupmask", "uint8_t", 0),
+    VariableEntry("posCtlPid", "xVelMax", "float", 1.0),
+    VariableEntry("posCtlPid", "yVelMax", "float", 1.0),
+    VariableEntry("posCtlPid", "zVelMax", "float", 1.0),
+    VariableEntry("ring", "effect", "uint8_t", 6),
+    VariableEntry("led", "bitmask", "uint8_t", 0),
+    VariableEntry("usd", "logging", "uint8_t", 0),
+    VariableEntry("colAv", "enable", "uint8_t", 0),
+    VariableEntry("firmware", "revision0", "uint32_t", 0xD75A0001, read_only=True),
+    VariableEntry("firmware", "modified", "uint8_t", 0, read_only=True),
+    VariableEntry("deck", "bcLighthouse4", "uint8_t", 1, read_only=True),
 )
 
 PARAM_ID = {entry.full_name: index for index, entry in enumerate(PARAM_ENTRIES)}
 
 
-class Table:
+class VariableTable:
     """A table of contents that answers the host's questions (protocol version 4 and later)."""
 
     INFO = 3
     ITEM = 2
 
-    def __init__(self, entries: Sequence[Entry], *, log: bool) -> None:
+    def __init__(self, entries: Sequence[VariableEntry], *, log: bool) -> None:
         self.entries = tuple(entries)
         types = LOG_TYPES if log else PARAM_TYPES
         self._items = [  # as they go over the air: type, group, name
@@ -164,8 +164,8 @@ class Table:
         return None
 
 
-LOG_TABLE = Table(LOG_ENTRIES, log=True)
-PARAM_TABLE = Table(PARAM_ENTRIES, log=False)
+LOG_TABLE = VariableTable(LOG_ENTRIES, log=True)
+PARAM_TABLE = VariableTable(PARAM_ENTRIES, log=False)
 
 
 def saturate(value: float, form: str) -> float | int:

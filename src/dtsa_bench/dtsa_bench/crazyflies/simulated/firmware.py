@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from dtsa_agent.crazyflie.state import decompress_quaternion, yaw_of
 
 from .planner import DISABLED, Goal, Planner, Triple
-from .supervisor import LEVEL_OUT, Supervisor
+from .supervisor import LEVEL_OUT, FirmwareSupervisor
 
 # What the vehicle does during a step.
 OFF = "off"  # motors stopped: it falls, or stands
@@ -56,7 +56,7 @@ class Battery:
 
 
 @dataclass(slots=True)
-class Setpoint:
+class FirmwareSetpoint:
     """What a streamed command or the planner asks for; None: that axis is not controlled so."""
 
     time: float
@@ -70,33 +70,33 @@ class Setpoint:
     motors: bool = True
 
 
-def _decode_position(data: bytes, t: float) -> Setpoint:
+def _decode_position(data: bytes, t: float) -> FirmwareSetpoint:
     x, y, z, yaw = struct.unpack_from("<4f", data)
-    return Setpoint(t, position=(x, y, z), yaw=math.radians(yaw))
+    return FirmwareSetpoint(t, position=(x, y, z), yaw=math.radians(yaw))
 
 
-def _decode_velocity(data: bytes, t: float) -> Setpoint:
+def _decode_velocity(data: bytes, t: float) -> FirmwareSetpoint:
     x, y, z, rate = struct.unpack_from("<4f", data)
-    return Setpoint(t, velocity=(x, y, z), yaw_rate=math.radians(rate))
+    return FirmwareSetpoint(t, velocity=(x, y, z), yaw_rate=math.radians(rate))
 
 
-def _decode_hover(data: bytes, t: float) -> Setpoint:
+def _decode_hover(data: bytes, t: float) -> FirmwareSetpoint:
     vx, vy, rate, height = struct.unpack_from("<4f", data)
-    return Setpoint(t, body_velocity=(vx, vy), height=height, yaw_rate=math.radians(rate))
+    return FirmwareSetpoint(t, body_velocity=(vx, vy), height=height, yaw_rate=math.radians(rate))
 
 
-def _decode_full_state(data: bytes, t: float) -> Setpoint:
+def _decode_full_state(data: bytes, t: float) -> FirmwareSetpoint:
     values = struct.unpack_from("<9hI3h", data)
     position, velocity, acceleration = (
         (values[i] / 1000, values[i + 1] / 1000, values[i + 2] / 1000) for i in (0, 3, 6)
     )
     yaw = yaw_of(decompress_quaternion(values[9]))
-    return Setpoint(t, position, velocity, acceleration, yaw=yaw, yaw_rate=values[12] / 1000)
+    return FirmwareSetpoint(t, position, velocity, acceleration, yaw=yaw, yaw_rate=values[12] / 1000)
 
 
-# Type byte of a packet on the generic commander's port -> decoder. 8 and 10 count yaw rates as everybody does; the
+# Type byte of a packet on the generic commander's port -> decoder. 8 and 10 count yaw rates as usual; the
 # older 1 and 5 have the opposite sign and are not sent to protocol version 9 and later.
-DECODERS: dict[int, tuple[int, Callable[[bytes, float], Setpoint]]] = {
+DECODERS: dict[int, tuple[int, Callable[[bytes, float], FirmwareSetpoint]]] = {
     6: (28, _decode_full_state),
     7: (16, _decode_position),
     8: (16, _decode_velocity),
@@ -119,11 +119,11 @@ class Firmware:
 
     def reset(self) -> None:
         """Power on."""
-        self.supervisor = Supervisor(self._report, auto_arming=self._auto_arming)
+        self.supervisor = FirmwareSupervisor(self._report, auto_arming=self._auto_arming)
         self.planner = Planner()
         self.groups = 0  # a bit each
         self.battery = Battery()
-        self.setpoint: Setpoint | None = None
+        self.setpoint: FirmwareSetpoint | None = None
         self._priority = PRIORITY_NONE
         self._streaming = False
         self._here = Goal()  # where a path would begin: on the present path, or where the vehicle is
@@ -134,7 +134,7 @@ class Firmware:
         """A packet of the generic commander: a streamed setpoint."""
         kind = data[0] if data else -1
         if kind == 0:
-            self._accept(Setpoint(t, motors=False))
+            self._accept(FirmwareSetpoint(t, motors=False))
         elif kind in DECODERS and len(data) > DECODERS[kind][0]:
             self._accept(DECODERS[kind][1](data[1:], t))
 
@@ -143,17 +143,17 @@ class Firmware:
         if len(data) < 14:
             return
         *_, thrust = struct.unpack_from("<3fH", data)
-        self._accept(Setpoint(t, velocity=(0.0, 0.0, 0.0), motors=thrust > 0))
+        self._accept(FirmwareSetpoint(t, velocity=(0.0, 0.0, 0.0), motors=thrust > 0))
 
     @property
     def priority(self) -> int:
         """Priority of the source whose setpoint counts."""
         return self._priority
 
-    def _accept(self, setpoint: Setpoint) -> None:
+    def _accept(self, setpoint: FirmwareSetpoint) -> None:
         self.offer(setpoint, PRIORITY_STREAM)
 
-    def offer(self, setpoint: Setpoint, priority: int) -> bool:
+    def offer(self, setpoint: FirmwareSetpoint, priority: int) -> bool:
         """Accept a setpoint from a source of this priority; False: one of a higher priority counts."""
         if priority < self._priority:
             return False
@@ -229,11 +229,11 @@ class Firmware:
         """The high-level commander's setpoint: where to be, or motors off if it has nothing to fly."""
         self._priority = PRIORITY_HIGH_LEVEL
         if goal is None:
-            self.setpoint = Setpoint(t, motors=False)
+            self.setpoint = FirmwareSetpoint(t, motors=False)
         else:
-            self.setpoint = Setpoint(t, goal.position, goal.velocity, goal.acceleration, yaw=goal.yaw)
+            self.setpoint = FirmwareSetpoint(t, goal.position, goal.velocity, goal.acceleration, yaw=goal.yaw)
 
-    def _velocity(self, s: Setpoint, position: Triple, dt: float) -> Triple:
+    def _velocity(self, s: FirmwareSetpoint, position: Triple, dt: float) -> Triple:
         if s.yaw is not None:
             self.yaw = s.yaw
         else:

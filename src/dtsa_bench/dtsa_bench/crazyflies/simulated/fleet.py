@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.crazyflies.simulated.radio.side import Host, RadioSide
+from dtsa_bench.crazyflies.simulated.radio.side import RadioHost, RadioServer
 
 from .fleet_config import HOST, FleetConfig
-from .peer import Peer
+from .motion import TICK_S, FleetMotion
+from .peer import CrtpPeer
 from .process import check_fault
 from .truth import TruthLog
-from .world import TICK_S, World
 
 NUMBERS = ("rate", "direction", "voltage", "distance", "dongle", "seconds")
 MAX_LAG_S = 0.5  # a machine that lags further behind skips time, and the record says so
@@ -34,7 +34,7 @@ class _Link:
     """Socket and link faults of one vehicle."""
 
     socket: socket.socket | None
-    host: tuple[str, int] | None = None  # who sent last
+    host: tuple[str, int] | None = None  # of the last datagram
     drop_up: float = 0.0
     drop_down: float = 0.0
     frozen: bool = False
@@ -51,7 +51,7 @@ class Fleet:
         self.config = config
         # epoll waits in whole milliseconds, which are long on the air.
         self._selector = selectors.SelectSelector() if config.radio.path is not None else selectors.DefaultSelector()
-        self.radio: RadioSide | None = None
+        self.radio: RadioServer | None = None
         self._links: list[_Link] = []
         self._control: socket.socket | None = None
         self._open_sockets()
@@ -69,10 +69,10 @@ class Fleet:
             self.close()
             raise ConfigError("truth", str(config.truth), f"a file that can be written ({error.strerror})") from error
         self.tick = 0
-        self.world = World(config, self._report)
-        self.vehicles, self.firmware, self.estimates = self.world.vehicles, self.world.firmware, self.world.estimates
+        self.motion = FleetMotion(config, self._report)
+        self.vehicles, self.firmware, self.estimates = self.motion.vehicles, self.motion.firmware, self.motion.estimates
         self.peers = [
-            Peer(f, e, config.protocol, k)
+            CrtpPeer(f, e, config.protocol, k)
             for k, (f, e) in enumerate(zip(self.firmware, self.estimates, strict=True), 1)
         ]
         self._loss = np.random.default_rng(np.random.SeedSequence(config.seed).spawn(3)[1])
@@ -93,7 +93,7 @@ class Fleet:
 
     def _open_sockets(self) -> None:
         if self.config.radio.path is not None:
-            self.radio = RadioSide(self.config.radio, self._hear, self._passes)
+            self.radio = RadioServer(self.config.radio, self._hear, self._passes)
             self._selector.register(self.radio.listener, selectors.EVENT_READ, self.radio)
             self._links = [_Link(None) for _ in range(self.config.count)]
         for k in range(0 if self.radio else self.config.count):
@@ -149,7 +149,7 @@ class Fleet:
     # -- motion -----------------------------------------------------------------------------------------------------
     def step(self) -> None:
         """Fly for one tick of 10 ms and send what is due."""
-        self.world.step(self.time, self._tick)
+        self.motion.step(self.time, self._tick)
         self.truth.positions(self.time, self.vehicles.position)
         self._send_logs()
         for k, link in enumerate(self._links):
@@ -168,9 +168,9 @@ class Fleet:
             due = self.radio.wait_s()
             timeout = timeout if due is None else min(timeout, due)
         for key, _ in self._selector.select(timeout):
-            if isinstance(key.data, (RadioSide, Host)):
+            if isinstance(key.data, (RadioServer, RadioHost)):
                 assert self.radio is not None
-                self.radio.take(key.data if isinstance(key.data, Host) else None, self._selector)
+                self.radio.serve_host(key.data if isinstance(key.data, RadioHost) else None, self._selector)
                 continue
             if key.data < 0:
                 self._serve_control()
@@ -219,9 +219,9 @@ class Fleet:
             now = self.radio.now_ns() / 1e9
             for peer, receiver in zip(self.peers, self.radio.receivers, strict=True):
                 packets = list(peer.log_packets(self.tick, self.time)) if peer.blocks else ()
-                if packets and not receiver.connected(now):  # nobody is there: the log ends
+                if packets and not receiver.connected(now):  # no host is there: the log ends
                     peer.blocks.clear()
-                    receiver.silent()
+                    receiver.clear()
                 else:
                     for packet in packets:
                         receiver.push(packet)
@@ -254,10 +254,7 @@ class Fleet:
             self._control.sendto(json.dumps(answer, default=str).encode(), host)
 
     def fault(self, request: dict[str, Any]) -> None:
-        """Let vehicles fail (see `check_fault`).
-
-        :raises ConfigError: it is not understood.
-        """
+        """Let vehicles fail (see `check_fault`); ConfigError: it is not understood."""
         name, indices = check_fault(request, self.config.count)
         for k in indices:
             self._apply(name, k, request)

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 from dtsa_agent.core.settings.flight_models import AVOIDERS, flight_model
-from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
 
 from .peer import PROTOCOLS
 
 MAX_COUNT = 200
 HOST = "127.0.0.1"
 LAYOUTS = ("ellipse", "grid", "line")
+DEVICES = {"pa": 0x0301, "2": 0x0504}  # Crazyradio PA, Crazyradio 2.0: version of the firmware as USB says it
 
 
 def start_positions(layout: str, count: int, half_axes: tuple[float, float] = (1.2, 2.0)) -> NDArray[np.float64]:
@@ -48,6 +48,51 @@ def _spread(index: NDArray[np.int64], number: int, half: float) -> NDArray[np.fl
     if number == 1:
         return np.zeros(len(index))
     return np.asarray(half * (2 * index / (number - 1) - 1), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class RadioAddress:
+    """Where one Crazyflie listens."""
+
+    uri: str = "radio://0/80/2M"
+    channel: int = 80
+    rate: str = "2M"
+    address: bytes = b"\xe7\xe7\xe7\xe7\xe7"
+
+    @classmethod
+    def of(cls, uri: str) -> RadioAddress:
+        """The station of a URI such as radio://0/80/2M/E7E7E7E701; ConfigError: it is not of that kind."""
+        parts = uri.partition("?")[0].removeprefix("radio://").split("/")
+        if not uri.startswith("radio://") or len(parts) != 4:
+            raise ConfigError("uri", uri, "radio://RADIO/CHANNEL/RATE/ADDRESS for a simulated radio")
+        return cls(uri, int(parts[1]), parts[2], bytes.fromhex(parts[3]))
+
+
+@dataclass(frozen=True, slots=True)
+class RadioSettings(Settings):
+    """Dongles and air.
+
+    :param path: the Unix socket to which hosts connect; None: no radios.
+    :param stations: where each Crazyflie listens.
+    """
+
+    dongles: int = setting(4, "number of simulated Crazyradios", minimum=1, maximum=16)
+    device: str = setting("2", "kind of the dongles: Crazyradio PA, or Crazyradio 2.0", choices=tuple(DEVICES))
+    loss: float = setting(
+        0.0, "share of packets, and of acknowledgements, that are lost on the air", minimum=0.0, maximum=1.0
+    )
+    seed: int = setting(1, "seed of the losses on the air", minimum=0, maximum=2**63 - 1)
+    usb_ms: float = setting(
+        0.2, "turn-round of a packet on USB, both ways together", unit="ms", minimum=0.0, maximum=100.0
+    )
+    request_ms: float = setting(
+        1.0, "a request on USB that sets channel, address or data rate", unit="ms", minimum=0.0, maximum=100.0
+    )
+    path: Path | None = None
+    stations: tuple[RadioAddress, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @dataclass(frozen=True, slots=True)

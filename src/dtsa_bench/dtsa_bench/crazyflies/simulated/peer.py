@@ -19,7 +19,7 @@ Handler = Callable[[bytes, float], "bytes | None"]
 
 
 @dataclass(slots=True)
-class Block:
+class LogBlock:
     """One log block: variables that are sent together."""
 
     variables: list[tuple[str, str]] = field(default_factory=list)  # full name, struct format of the fetched type
@@ -34,11 +34,11 @@ class Block:
         return b"".join(struct.pack("<" + form, crtp.saturate(values[name], form)) for name, form in self.variables)
 
 
-class OnBoard(Protocol):
+class OnboardApp(Protocol):
     """An app on board: it adds parameters and log variables, and gets packets of the app channel."""
 
-    parameters: Sequence[crtp.Entry]
-    logs: Sequence[crtp.Entry]
+    parameters: Sequence[crtp.VariableEntry]
+    logs: Sequence[crtp.VariableEntry]
     receive: Callable[[bytes], object]
 
     def parameter(self, name: str) -> float: ...
@@ -48,7 +48,7 @@ class OnBoard(Protocol):
     def log_values(self) -> Mapping[str, float]: ...
 
 
-class Peer:
+class CrtpPeer:
     """Protocol state of one simulated Crazyflie: log blocks and parameter values. Times (`t`) are s, the fleet's clock.
 
     The last byte of its address is its number, by which packets to several name it.
@@ -60,8 +60,8 @@ class Peer:
         self.protocol = protocol
         self.number = number
         self.positions_received = 0
-        self.blocks: dict[int, Block] = {}
-        self._app: OnBoard | None = None
+        self.blocks: dict[int, LogBlock] = {}
+        self._app: OnboardApp | None = None
         self._params, self._logs = crtp.PARAM_ENTRIES, crtp.LOG_ENTRIES
         self._param_table, self._log_table = crtp.PARAM_TABLE, crtp.LOG_TABLE
         self.values = [entry.value for entry in self._params]
@@ -70,7 +70,7 @@ class Peer:
             (crtp.LINK, 1): lambda data, t: b"Bitcraze Crazyflie".ljust(30, b"\0"),
             (crtp.LINK, 3): lambda data, t: data,
             (crtp.PLATFORM, 0): self._platform,
-            (crtp.PLATFORM, 1): self._version,
+            (crtp.PLATFORM, 1): lambda data, t: bytes((0, self.protocol)) if data[:1] == b"\0" else None,
             (crtp.PLATFORM, 2): self._app_channel,
             (crtp.LOG, 0): lambda data, t: self._log_table.answer(data),
             (crtp.LOG, 1): self._log_settings,
@@ -79,13 +79,13 @@ class Peer:
             (crtp.PARAM, 2): self._param_write,
             (crtp.PARAM, 3): self._param_misc,
             (crtp.MEMORY, 0): lambda data, t: b"\x01\0" if data[:1] == b"\x01" else None,  # there are none
-            (crtp.COMMANDER, 0): self._manual,
+            (crtp.COMMANDER, 0): lambda data, t: self.firmware.manual(data, t),
             (crtp.LOCALIZATION, 0): self._ext_position,
             (crtp.LOCALIZATION, 1): self._localization,
             (crtp.LOCALIZATION, 2): self._ext_positions,
-            (crtp.GENERIC_COMMANDER, 0): self._stream,
+            (crtp.GENERIC_COMMANDER, 0): lambda data, t: self.firmware.stream(data, t),
             (crtp.GENERIC_COMMANDER, 1): self._meta,
-            (crtp.HIGH_LEVEL, 0): self._high_level,
+            (crtp.HIGH_LEVEL, 0): lambda data, t: data[:3] + bytes((self.firmware.high_level(data, t),)),
         }
         if protocol >= 12:
             self._handlers[crtp.SUPERVISOR, 0] = self._supervisor_info
@@ -96,12 +96,15 @@ class Peer:
         self.blocks.clear()
         self.values = [entry.value for entry in self._params]
 
-    def adopt(self, app: OnBoard) -> None:
+    def adopt(self, app: OnboardApp) -> None:
         """An app has started on board: its variables are in the tables of contents."""
         self._app = app
         self._params = (*crtp.PARAM_ENTRIES, *app.parameters)
         self._logs = (*crtp.LOG_ENTRIES, *app.logs)
-        self._param_table, self._log_table = crtp.Table(self._params, log=False), crtp.Table(self._logs, log=True)
+        self._param_table, self._log_table = (
+            crtp.VariableTable(self._params, log=False),
+            crtp.VariableTable(self._logs, log=True),
+        )
         self.values[len(crtp.PARAM_ENTRIES) :] = [entry.value for entry in app.parameters]
 
     def receive(self, datagram: bytes, t: float) -> bytes | None:
@@ -135,9 +138,6 @@ class Peer:
             self._app.receive(data)
 
     # -- handlers: request's data and time in, reply's data out -----------------------------------------------------
-    def _version(self, data: bytes, t: float) -> bytes | None:
-        return bytes((0, self.protocol)) if data[:1] == b"\0" else None
-
     def _platform(self, data: bytes, t: float) -> bytes | None:
         if data[:1] == b"\x01" and len(data) > 1:
             ok = self.firmware.supervisor.request_arming(bool(data[1]))
@@ -196,18 +196,9 @@ class Peer:
         elif kind == 4:
             self.firmware.supervisor.watchdog(t)
 
-    def _manual(self, data: bytes, t: float) -> None:
-        self.firmware.manual(data, t)
-
-    def _stream(self, data: bytes, t: float) -> None:
-        self.firmware.stream(data, t)
-
     def _meta(self, data: bytes, t: float) -> None:
         if data[:1] == b"\0":
             self.firmware.notify_stop()
-
-    def _high_level(self, data: bytes, t: float) -> bytes:
-        return data[:3] + bytes((self.firmware.high_level(data, t),))
 
     def _log_settings(self, data: bytes, t: float) -> bytes | None:
         command = data[0]
@@ -234,14 +225,14 @@ class Peer:
             return errno.EEXIST
         if not create and number not in self.blocks:
             return errno.ENOENT
-        block = Block() if create else self.blocks[number]
+        block = LogBlock() if create else self.blocks[number]
         variables = list(block.variables)
         for kind, index in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
             form = crtp.LOG_FORMAT_BY_CODE.get(kind & 15)
             if form is None or index >= len(self._logs):
                 return errno.ENOENT
             variables.append((self._logs[index].full_name, form))
-        if Block(variables).size > MAX_BLOCK_BYTES:
+        if LogBlock(variables).size > MAX_BLOCK_BYTES:
             return errno.E2BIG
         block.variables = variables
         self.blocks[number] = block

@@ -10,7 +10,7 @@ Triple = tuple[float, float, float]
 IDLE = "idle"  # holds the motors off: nothing was ordered yet, a landing is over, or a streamed command took over
 FLYING = "flying"
 LANDING = "landing"
-DISABLED = "disabled"  # neither wants motors on nor off: somebody else gives set-points
+DISABLED = "disabled"  # neither wants motors on nor off: another source gives set-points
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ def evaluate(coefficients: tuple[float, ...], t: float) -> Triple:
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class PlannedPath:
     """One flight from here to there."""
 
     start: float  # s
@@ -76,7 +76,7 @@ class Planner:
 
     def __init__(self) -> None:
         self.state = IDLE
-        self.path: Path | None = None
+        self.path: PlannedPath | None = None
 
     def stop(self) -> None:
         """Motors off, and the path is forgotten."""
@@ -114,7 +114,7 @@ class Planner:
     def _plan(self, t: float, here: Goal, place: Triple, yaw: float, duration: float) -> None:
         starts = zip(here.position, here.velocity, here.acceleration, place, strict=True)
         axes = tuple(septic(p, v, a, end, duration) for p, v, a, end in starts)
-        self.path = Path(t, duration, axes, Goal(place, yaw=yaw))
+        self.path = PlannedPath(t, duration, axes, Goal(place, yaw=yaw))
 
     def finished(self, t: float) -> bool:
         """True once the last path has been flown (or there is none)."""

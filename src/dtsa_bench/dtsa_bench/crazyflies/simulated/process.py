@@ -26,7 +26,7 @@ _END_S = 10.0
 def free_base_port(count: int, first: int | None = None) -> int:
     """Base port of a fleet: it, the `count` - 1 after it, and the control port before it are free now.
 
-    :param first: the lowest base port that will do; None: any, so that two who look at the same time seldom agree.
+    :param first: the lowest base port that will do; None: any, so that two processes that search at once seldom agree.
     :raises ConfigError: there are not so many free ports in a row.
     """
     low = FIRST if first is None else first
@@ -135,7 +135,7 @@ def check_fault(request: dict[str, Any], count: int) -> tuple[str, list[int]]:
 def send_fault(address: tuple[str, int], timeout: float = 1.0, **request: Any) -> dict[str, Any]:
     """Tell a running fleet to fail, for `seconds` or until healed; its answer, with its time `t`.
 
-    :raises ConfigError: nobody answers at its host and control port, or the request was refused.
+    :raises ConfigError: no answer from its host and control port, or the request was refused.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.settimeout(timeout)

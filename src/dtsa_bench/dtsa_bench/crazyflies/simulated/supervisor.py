@@ -32,7 +32,7 @@ IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
 HL_ACTIVE, HL_FINISHED = 256, 512
 
 
-class Supervisor:
+class FirmwareSupervisor:
     """State machine of one Crazyflie; `auto_arming`: a 2.1 or 2.1+, a 2.1 brushless or a Bolt waits to be armed."""
 
     def __init__(self, report: Callable[..., None], *, auto_arming: bool = False) -> None:
@@ -42,7 +42,7 @@ class Supervisor:
         self.armed = auto_arming
         self.tumbled = False
         self.refuse_arming = False
-        self.crashed = False  # until somebody asks for recovery
+        self.crashed = False  # until recovery is requested
         self.emergency = ""  # why an emergency stop is in force; latches until a reboot
         self._watchdog: float | None = None  # time of the last watchdog packet
         self._thrust: float | None = None  # time of the last thrust

@@ -52,7 +52,7 @@ int configblockGetRadioSpeed(void) { return own()->speed; }
 
 uint64_t configblockGetRadioAddress(void) { return own()->address; }
 
-// ---- what the world decides ------------------------------------------------------------------------------------------
+// ---- commands to the firmware ------------------------------------------------------------------------------------------
 
 static int command(int code, const void *data, size_t size)
 {
@@ -73,7 +73,7 @@ void commanderSetSetpoint(setpoint_t *s, int priority)
     struct {
         int32_t priority, mode[7], body;
         float position[3], velocity[3], attitude[3], rate[3], thrust;
-    } told = {
+    } packed = {
         priority,
         {s->mode.x, s->mode.y, s->mode.z, s->mode.roll, s->mode.pitch, s->mode.yaw, s->mode.quat},
         s->velocity_body,
@@ -83,7 +83,7 @@ void commanderSetSetpoint(setpoint_t *s, int priority)
         {s->attitudeRate.roll, s->attitudeRate.pitch, s->attitudeRate.yaw},
         s->thrust,
     };
-    command(COMMAND_SETPOINT, &told, sizeof told);
+    command(COMMAND_SETPOINT, &packed, sizeof packed);
 }
 
 void commanderRelaxPriority(void)
@@ -140,25 +140,25 @@ bool supervisorRequestCrashRecovery(bool recover)
     return command(COMMAND_RECOVER, (float[]){recover}, sizeof(float)) != 0;
 }
 
-// ---- what the world says ---------------------------------------------------------------------------------------------
+// ---- state of the firmware ---------------------------------------------------------------------------------------------
 
-static double world(const char *name)
+static double firmware_value(const char *name)
 {
     spend(CALL_NS);
-    for (int i = 0; i < lab.world_count; i++)
-        if (!strcmp(lab.world_names[i], name)) return own()->world[i];
+    for (int i = 0; i < lab.log_name_count; i++)
+        if (!strcmp(lab.log_names[i], name)) return own()->log_values[i];
     return 0.0;
 }
 
-int commanderGetActivePriority(void) { return (int)world("lab.priority"); }
+int commanderGetActivePriority(void) { return (int)firmware_value("lab.priority"); }
 
 enum trajectory_state crtpCommanderHighLevelGetPlannerState(void)
 {
-    return (enum trajectory_state)world("lab.planner");
+    return (enum trajectory_state)firmware_value("lab.planner");
 }
 
 // Bits of `supervisor.info`.
-uint16_t supervisorGetInfoBitfield(void) { return (uint16_t)world("supervisor.info"); }
+uint16_t supervisorGetInfoBitfield(void) { return (uint16_t)firmware_value("supervisor.info"); }
 
 bool supervisorCanArm(void) { return supervisorGetInfoBitfield() & 1; }
 
@@ -180,13 +180,13 @@ bool crtpCommanderHighLevelIsStopped(void) { return !(supervisorGetInfoBitfield(
 
 bool crtpCommanderHighLevelIsTrajectoryFinished(void) { return supervisorGetInfoBitfield() & 512; }
 
-float pmGetBatteryVoltage(void) { return (float)world("pm.vbat"); }
+float pmGetBatteryVoltage(void) { return (float)firmware_value("pm.vbat"); }
 
-bool pmIsBatteryLow(void) { return (int)world("pm.state") == lowPower; }
+bool pmIsBatteryLow(void) { return (int)firmware_value("pm.state") == lowPower; }
 
-bool pmIsCharging(void) { return (int)world("pm.state") == charging; }
+bool pmIsCharging(void) { return (int)firmware_value("pm.state") == charging; }
 
-bool pmIsDischarging(void) { return (int)world("pm.state") == battery; }
+bool pmIsDischarging(void) { return (int)firmware_value("pm.state") == battery; }
 
 void systemWaitStart(void) { spend(CALL_NS); }
 
@@ -196,18 +196,18 @@ void labRegister(int parameters, const char *group, const struct labVariable *va
 {
     Vehicle *vehicle = lab.loading;
     if (!vehicle) return;
-    int *known = parameters ? &vehicle->parameter_count : &vehicle->log_count;
+    int *used = parameters ? &vehicle->parameter_count : &vehicle->log_count;
     Variable *table = parameters ? vehicle->parameters : vehicle->logs;
-    for (int i = 0; i < count && *known >= 0; i++) {
-        if (*known == MAX_VARIABLES) {
-            *known = -1;
+    for (int i = 0; i < count && *used >= 0; i++) {
+        if (*used == MAX_VARIABLES) {
+            *used = -1;
             return;
         }
-        Variable *one = &table[(*known)++];
-        one->type = variables[i].type;
-        one->address = variables[i].address;
-        one->callback = variables[i].callback;
-        snprintf(one->name, sizeof one->name, "%.30s.%.30s", group, variables[i].name);
+        Variable *variable = &table[(*used)++];
+        variable->type = variables[i].type;
+        variable->address = variables[i].address;
+        variable->callback = variables[i].callback;
+        snprintf(variable->name, sizeof variable->name, "%.30s.%.30s", group, variables[i].name);
     }
 }
 
@@ -307,7 +307,7 @@ void set_variable(Vehicle *vehicle, Variable *variable, double value)
         break;
     }
     Job job = {.callback = variable->callback};
-    if (job.callback) put(vehicle, &vehicle->parameter_jobs, &job, false);
+    if (job.callback) push_item(vehicle, &vehicle->parameter_jobs, &job, false);
 }
 
 logVarId_t logGetVarId(const char *group, const char *name)
@@ -315,18 +315,18 @@ logVarId_t logGetVarId(const char *group, const char *name)
     char full[64];
     snprintf(full, sizeof full, "%.30s.%.30s", group, name);
     spend(CALL_NS);
-    for (int i = 0; i < lab.world_count; i++)
-        if (!strcmp(lab.world_names[i], full)) return (logVarId_t)i;
+    for (int i = 0; i < lab.log_name_count; i++)
+        if (!strcmp(lab.log_names[i], full)) return (logVarId_t)i;
     int own_id = find(own()->logs, own()->log_count, full);
-    return own_id < 0 ? 0xffff : (logVarId_t)(lab.world_count + own_id);
+    return own_id < 0 ? 0xffff : (logVarId_t)(lab.log_name_count + own_id);
 }
 
 static double logged(logVarId_t id)
 {
     spend(CALL_NS);
-    if (id < lab.world_count) return own()->world[id];
-    if (id < lab.world_count + own()->log_count)
-        return variable_value(&own()->logs[id - lab.world_count]);
+    if (id < lab.log_name_count) return own()->log_values[id];
+    if (id < lab.log_name_count + own()->log_count)
+        return variable_value(&own()->logs[id - lab.log_name_count]);
     misuse("a log variable that does not exist");
 }
 
@@ -340,8 +340,8 @@ paramVarId_t paramGetVarIdFromComplete(const char *name)
 {
     spend(CALL_NS);
     int id = find(own()->parameters, own()->parameter_count, name);
-    for (int i = 0; id < 0 && i < lab.known_count; i++)
-        if (!strcmp(lab.known_names[i], name)) id = MAX_VARIABLES + i; // the firmware's own
+    for (int i = 0; id < 0 && i < lab.parameter_name_count; i++)
+        if (!strcmp(lab.parameter_names[i], name)) id = MAX_VARIABLES + i; // the firmware's own
     return (paramVarId_t){id < 0 ? 0xffff : (uint16_t)id, id < 0 ? 0xffff : (uint16_t)id};
 }
 
@@ -355,7 +355,7 @@ paramVarId_t paramGetVarId(const char *group, const char *name)
 static bool is_own(paramVarId_t id)
 {
     spend(CALL_NS);
-    if (id.id >= MAX_VARIABLES && id.id < MAX_VARIABLES + lab.known_count) return false;
+    if (id.id >= MAX_VARIABLES && id.id < MAX_VARIABLES + lab.parameter_name_count) return false;
     if (id.id >= own()->parameter_count) misuse("a parameter that does not exist");
     return true;
 }
@@ -363,7 +363,7 @@ static bool is_own(paramVarId_t id)
 static double parameter(paramVarId_t id)
 {
     if (is_own(id)) return variable_value(&own()->parameters[id.id]);
-    return own()->known[id.id - MAX_VARIABLES];
+    return own()->parameter_values[id.id - MAX_VARIABLES];
 }
 
 static void set_parameter(paramVarId_t id, double value)
@@ -372,8 +372,8 @@ static void set_parameter(paramVarId_t id, double value)
         set_variable(own(), &own()->parameters[id.id], value);
         return;
     }
-    float told[2] = {(float)(id.id - MAX_VARIABLES), (float)value};
-    command(COMMAND_PARAMETER, told, sizeof told);
+    float packed[2] = {(float)(id.id - MAX_VARIABLES), (float)value};
+    command(COMMAND_PARAMETER, packed, sizeof packed);
 }
 
 float paramGetFloat(paramVarId_t id) { return (float)parameter(id); }

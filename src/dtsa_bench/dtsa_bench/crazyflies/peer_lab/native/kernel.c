@@ -114,7 +114,7 @@ void init_queue(struct Queue *queue, uint8_t *storage, uint32_t length, uint32_t
     queue->item = item;
 }
 
-bool put(Vehicle *vehicle, struct Queue *queue, const void *item, bool front)
+bool push_item(Vehicle *vehicle, struct Queue *queue, const void *item, bool front)
 {
     if (queue->count == queue->length) return false;
     uint32_t place = (queue->first + queue->count) % queue->length;
@@ -125,16 +125,16 @@ bool put(Vehicle *vehicle, struct Queue *queue, const void *item, bool front)
     return true;
 }
 
-static bool look(struct Queue *queue, void *item)
+static bool peek_item(struct Queue *queue, void *item)
 {
     if (!queue->count) return false;
     if (queue->item) memcpy(item, queue->storage + queue->first * queue->item, queue->item);
     return true;
 }
 
-bool take(Vehicle *vehicle, struct Queue *queue, void *item)
+bool pop_item(Vehicle *vehicle, struct Queue *queue, void *item)
 {
-    if (!look(queue, item)) return false;
+    if (!peek_item(queue, item)) return false;
     queue->first = (queue->first + 1) % queue->length;
     queue->count--;
     wake(vehicle, queue, true);
@@ -159,11 +159,11 @@ static BaseType_t send(QueueHandle_t queue, const void *item, TickType_t ticks, 
 {
     spend(CALL_NS);
     if (!queue) misuse("a queue that was not created");
-    if (put(own(), queue, item, front)) return pdTRUE;
+    if (push_item(own(), queue, item, front)) return pdTRUE;
     if (!ticks) return pdFALSE;
     for (int64_t end = until(ticks);;) {
         bool woken = wait_for(queue, true, end);
-        if (put(own(), queue, item, front)) return pdTRUE;
+        if (push_item(own(), queue, item, front)) return pdTRUE;
         if (!woken) return pdFALSE;
     }
 }
@@ -183,18 +183,18 @@ BaseType_t xQueueOverwrite(QueueHandle_t queue, const void *item)
     spend(CALL_NS);
     if (!queue) misuse("a queue that was not created");
     queue->count = 0;
-    return put(own(), queue, item, false) ? pdPASS : pdFAIL;
+    return push_item(own(), queue, item, false) ? pdPASS : pdFAIL;
 }
 
 static BaseType_t receive(QueueHandle_t queue, void *item, TickType_t ticks, bool keep)
 {
     spend(CALL_NS);
     if (!queue) misuse("a queue that was not created");
-    if (keep ? look(queue, item) : take(own(), queue, item)) return pdTRUE;
+    if (keep ? peek_item(queue, item) : pop_item(own(), queue, item)) return pdTRUE;
     if (!ticks) return pdFALSE;
     for (int64_t end = until(ticks);;) {
         bool woken = wait_for(queue, false, end);
-        if (keep ? look(queue, item) : take(own(), queue, item)) return pdTRUE;
+        if (keep ? peek_item(queue, item) : pop_item(own(), queue, item)) return pdTRUE;
         if (!woken) return pdFALSE;
     }
 }
@@ -271,7 +271,7 @@ void timer_loop(void *argument)
         for (struct Timer *timer = vehicle->timers; timer; timer = timer->next)
             if (timer->due_ns != NEVER && (!first || timer->due_ns < first->due_ns)) first = timer;
         if (!first || first->due_ns > vehicle->free_ns) {
-            take(vehicle, &vehicle->timer_signal, NULL);
+            pop_item(vehicle, &vehicle->timer_signal, NULL);
             wait_for(&vehicle->timer_signal, false, first ? first->due_ns : NEVER);
             continue;
         }
@@ -307,7 +307,7 @@ TimerHandle_t xTimerCreate(const char *name, TickType_t period, UBaseType_t repe
 static BaseType_t set_timer(TimerHandle_t timer, int64_t due_ns)
 {
     timer->due_ns = due_ns;
-    put(own(), &own()->timer_signal, NULL, false);
+    push_item(own(), &own()->timer_signal, NULL, false);
     return pdPASS;
 }
 

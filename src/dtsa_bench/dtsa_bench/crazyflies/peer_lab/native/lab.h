@@ -122,8 +122,8 @@ struct Vehicle {
     int task_count; // places that were ever used
     Variable logs[MAX_VARIABLES], parameters[MAX_VARIABLES];
     int log_count, parameter_count;
-    double *world; // values of the firmware's own log variables
-    double *known; // values of the firmware's own parameters
+    double *log_values;       // values of the firmware's own log variables
+    double *parameter_values; // values of the firmware's own parameters
     P2PCallback callback;
     struct Queue radio_jobs, parameter_jobs, app_channel;
     uint8_t radio_storage[MAX_INBOX * sizeof(Job)], parameter_storage[MAX_INBOX * sizeof(Job)];
@@ -137,9 +137,9 @@ struct Vehicle {
 };
 
 typedef struct {
-    int count, world_count, known_count;
-    char (*world_names)[64]; // the firmware's own log variables
-    char (*known_names)[64]; // the firmware's own parameters
+    int count, log_name_count, parameter_name_count;
+    char (*log_names)[64];       // the firmware's own log variables
+    char (*parameter_names)[64]; // the firmware's own parameters
     Vehicle *vehicles;
     int64_t now_ns, horizon_ns, until_ns, turns, spin_ns;
     int64_t line_fixed_ns, line_byte_ns;
@@ -170,8 +170,8 @@ void watch_for_crashes(void);
 
 // Queues without waiting.
 void init_queue(struct Queue *queue, uint8_t *storage, uint32_t length, uint32_t item);
-bool put(Vehicle *vehicle, struct Queue *queue, const void *item, bool front);
-bool take(Vehicle *vehicle, struct Queue *queue, void *item);
+bool push_item(Vehicle *vehicle, struct Queue *queue, const void *item, bool front);
+bool pop_item(Vehicle *vehicle, struct Queue *queue, void *item);
 
 void timer_loop(void *argument);
 double variable_value(const Variable *variable);

@@ -154,7 +154,7 @@ static void resume(Task *task)
     lab.running = NULL;
 }
 
-// Runs the apps until a time, or until the owner is asked or told something.
+// Runs the apps until a time, or until the owner is asked or packed something.
 const Event *lab_run(int64_t until_ns)
 {
     lab.until_ns = until_ns;
@@ -189,7 +189,7 @@ void yield_event(void)
     lab.event.kind = EVENT_NONE;
 }
 
-static void tell(int kind, const char *text)
+static void report_event(int kind, const char *text)
 {
     snprintf((char *)lab.event.data, sizeof lab.event.data, "%s", text);
     lab.event.size = (int)strlen((char *)lab.event.data);
@@ -199,7 +199,7 @@ static void tell(int kind, const char *text)
 
 void misuse(const char *what)
 {
-    for (;;) tell(EVENT_MISUSE, what);
+    for (;;) report_event(EVENT_MISUSE, what);
 }
 
 void spend(int64_t ns)
@@ -219,7 +219,7 @@ void spend(int64_t ns)
         if (left == 0) break;
     }
     vehicle->free_ns = done;
-    if (done - task->began_ns > lab.spin_ns) tell(EVENT_SPINS, task->name);
+    if (done - task->began_ns > lab.spin_ns) report_event(EVENT_SPINS, task->name);
 }
 
 bool wait_for(struct Queue *queue, bool wants_room, int64_t until_ns)
@@ -256,41 +256,41 @@ void wake(Vehicle *vehicle, struct Queue *queue, bool room)
 
 // ---- the owner's side ------------------------------------------------------------------------------------------------
 
-static char (*copied(int count, const char *const *names))[64]
+static char (*copy_names(int count, const char *const *names))[64]
 {
     char (*copy)[64] = calloc((size_t)count + 1, sizeof *copy);
     for (int i = 0; copy && i < count; i++) snprintf(copy[i], sizeof copy[i], "%s", names[i]);
     return copy;
 }
 
-int lab_begin(int count, int world_count, const char *const *names, int known_count,
+int lab_begin(int count, int log_name_count, const char *const *names, int parameter_name_count,
               const char *const *known, int64_t line_fixed_ns, int64_t line_byte_ns,
               int64_t spin_ns)
 {
     memset(&lab, 0, sizeof lab);
     lab.count = count;
-    lab.world_count = world_count;
+    lab.log_name_count = log_name_count;
     lab.line_fixed_ns = line_fixed_ns;
     lab.line_byte_ns = line_byte_ns;
     lab.spin_ns = spin_ns;
     lab.vehicles = calloc((size_t)count, sizeof *lab.vehicles);
-    lab.world_names = copied(world_count, names);
-    lab.known_names = copied(known_count, known);
-    lab.known_count = known_count;
-    if (!lab.vehicles || !lab.world_names || !lab.known_names) return -1;
+    lab.log_names = copy_names(log_name_count, names);
+    lab.parameter_names = copy_names(parameter_name_count, known);
+    lab.parameter_name_count = parameter_name_count;
+    if (!lab.vehicles || !lab.log_names || !lab.parameter_names) return -1;
     for (int k = 0; k < count; k++) {
         lab.vehicles[k].number = k;
-        lab.vehicles[k].world = calloc((size_t)world_count, sizeof(double));
-        lab.vehicles[k].known = calloc((size_t)known_count + 1, sizeof(double));
-        if (!lab.vehicles[k].world || !lab.vehicles[k].known) return -1;
+        lab.vehicles[k].log_values = calloc((size_t)log_name_count, sizeof(double));
+        lab.vehicles[k].parameter_values = calloc((size_t)parameter_name_count + 1, sizeof(double));
+        if (!lab.vehicles[k].log_values || !lab.vehicles[k].parameter_values) return -1;
     }
     watch_for_crashes();
     return 0;
 }
 
-double *lab_world(int vehicle) { return lab.vehicles[vehicle].world; }
+double *lab_log_values(int vehicle) { return lab.vehicles[vehicle].log_values; }
 
-double *lab_known(int vehicle) { return lab.vehicles[vehicle].known; }
+double *lab_parameter_values(int vehicle) { return lab.vehicles[vehicle].parameter_values; }
 
 void lab_off(int number)
 {
@@ -306,12 +306,12 @@ void lab_end(void)
 {
     for (int k = 0; k < lab.count; k++) {
         lab_off(k);
-        free(lab.vehicles[k].world);
-        free(lab.vehicles[k].known);
+        free(lab.vehicles[k].log_values);
+        free(lab.vehicles[k].parameter_values);
     }
     free(lab.vehicles);
-    free(lab.world_names);
-    free(lab.known_names);
+    free(lab.log_names);
+    free(lab.parameter_names);
     memset(&lab, 0, sizeof lab);
 }
 
@@ -321,10 +321,10 @@ static void radio_task(void *argument)
 {
     Vehicle *vehicle = argument;
     for (Job job;;) {
-        while (!take(vehicle, &vehicle->radio_jobs, &job))
+        while (!pop_item(vehicle, &vehicle->radio_jobs, &job))
             wait_for(&vehicle->radio_jobs, false, NEVER);
         lab.event.kind = EVENT_HEARD;
-        lab.event.code = vehicle->callback ? job.packet.rssi : -1; // -1: nobody wants it
+        lab.event.code = vehicle->callback ? job.packet.rssi : -1; // -1: no callback
         lab.event.size = job.packet.size + 1;
         memcpy(lab.event.data, job.packet.raw, (size_t)job.packet.size + 1);
         yield_event();
@@ -336,7 +336,7 @@ static void parameter_task(void *argument)
 {
     Vehicle *vehicle = argument;
     for (Job job;;) {
-        while (!take(vehicle, &vehicle->parameter_jobs, &job))
+        while (!pop_item(vehicle, &vehicle->parameter_jobs, &job))
             wait_for(&vehicle->parameter_jobs, false, NEVER);
         job.callback();
     }
@@ -378,7 +378,7 @@ const char *lab_boot(int number, const char *path, int64_t now_ns, int64_t clock
 }
 
 // A peer-to-peer packet has come from the radio. Returns 0 when the firmware's queue is full.
-int lab_hear(int number, int64_t now_ns, const uint8_t *raw, int size, int rssi)
+int lab_receive(int number, int64_t now_ns, const uint8_t *raw, int size, int rssi)
 {
     Vehicle *vehicle = &lab.vehicles[number];
     Job job = {0};
@@ -387,7 +387,7 @@ int lab_hear(int number, int64_t now_ns, const uint8_t *raw, int size, int rssi)
     job.packet.size = (uint8_t)(size - 1);
     job.packet.rssi = (uint8_t)rssi;
     memcpy(job.packet.raw, raw, (size_t)size);
-    return put(vehicle, &vehicle->radio_jobs, &job, false);
+    return push_item(vehicle, &vehicle->radio_jobs, &job, false);
 }
 
 // A packet of the app channel has come from the ground. Returns 0 when the queue of ten is full.
@@ -399,7 +399,7 @@ int lab_app_channel(int number, int64_t now_ns, const uint8_t *data, int size)
     lab.now_ns = now_ns;
     item[0] = (uint8_t)size;
     memcpy(item + 1, data, (size_t)size);
-    if (put(vehicle, &vehicle->app_channel, item, false)) return 1;
+    if (push_item(vehicle, &vehicle->app_channel, item, false)) return 1;
     vehicle->app_overflow = true;
     return 0;
 }

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from dtsa_bench.crazyflies.simulated.fleet_config import DEVICES, RadioSettings
 from dtsa_channel_sim.model.medium import OnAir
 
-from . import esb
-from .air import Agenda, RadioAir
-from .receiver import Receiver
-from .settings import DEVICES, RadioSettings
+from .air import BROADCAST, MAX_PAYLOAD, RATE_NAMES, Agenda, RadioAir, between_crazyflies, retry_delay_ns
+from .receiver import RadioReceiver
 from .sniffer_mode import FIRST_FIRMWARE, SnifferMode, Tuned
 
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_POWER, SET_ARD, SET_ARC = range(1, 7)
@@ -36,7 +35,7 @@ class _Transfer:
     reply: tuple[OnAir, bytes] | None = None  # the acknowledgement to this dongle
 
 
-class Dongle:
+class DongleModel:
     """One Crazyradio; radios are named by their ids on the air. It adds its own sniffer to those of all dongles.
 
     :param passes: says whether a packet to (True) or from a Crazyflie passes the faults of its link.
@@ -48,7 +47,7 @@ class Dongle:
         settings: RadioSettings,
         air: RadioAir,
         agenda: Agenda,
-        receivers: dict[int, Receiver],
+        receivers: dict[int, RadioReceiver],
         passes: Callable[[int, bool], bool],
         sniffers: dict[int, SnifferMode],
     ) -> None:
@@ -78,8 +77,8 @@ class Dongle:
             self._channel = value
         elif number == SET_ADDRESS and len(data) == 5:
             self._address = bytes(data)
-        elif number == SET_RATE and value < len(esb.RATE_NAMES):
-            self._rate = esb.RATE_NAMES[value]
+        elif number == SET_RATE and value < len(RATE_NAMES):
+            self._rate = RATE_NAMES[value]
         elif number == SET_ARD:
             self._ard = value & 0xFF
         elif number == SET_ARC:
@@ -126,13 +125,13 @@ class Dongle:
         half = round(self._settings.usb_ms * 0.5e6)
         start = max(now, self._busy_ns) + half
         if self._ack:
-            parts = [packet[: esb.MAX_PAYLOAD]]
-        elif len(packet) > esb.MAX_PAYLOAD:  # two of the same length
+            parts = [packet[:MAX_PAYLOAD]]
+        elif len(packet) > MAX_PAYLOAD:  # two of the same length
             parts = [packet[: len(packet) // 2], packet[len(packet) // 2 : len(packet) // 2 * 2]]
         else:
             parts = [packet]
         if not self._can_send:
-            if self._ack:  # a Crazyradio 2.0 says that nobody has answered
+            if self._ack:  # a Crazyradio 2.0 reports that no answer came
                 self._finish(_Transfer(packet, answer, True), start, b"\0")
             return
         for part in parts:
@@ -147,16 +146,16 @@ class Dongle:
         return frame.end_ns
 
     def _arrived(self, transfer: _Transfer, frame: OnAir, channel: int, rate: str, address: bytes) -> None:
-        """The packet has left the air: who has it?"""
-        heard = self._air.heard(channel, frame)
+        """Find the receivers of a packet that has left the air."""
+        heard = self._air.receivers_of(channel, frame)
         self.overheard(heard, address, transfer.packet, channel, rate, frame)
         seconds = frame.end_ns / 1e9
         replies = []
         for radio, receiver in self._reached(heard, channel, rate, address):
-            if address == esb.BROADCAST:
-                receiver.hear_all(transfer.packet, seconds)
+            if address == BROADCAST:
+                receiver.receive_broadcast(transfer.packet, seconds)
             else:
-                payload = receiver.hear(transfer.packet, seconds)
+                payload = receiver.receive(transfer.packet, seconds)
                 replies.append((self._air.send(channel, rate, radio, frame.end_ns, len(payload)), radio, payload))
         if not transfer.acknowledged:
             return
@@ -169,13 +168,13 @@ class Dongle:
         else:
             self._agenda.at(over, lambda: self._missed(transfer, over))
 
-    def _reached(self, heard: set[int], channel: int, rate: str, address: bytes) -> list[tuple[int, Receiver]]:
+    def _reached(self, heard: set[int], channel: int, rate: str, address: bytes) -> list[tuple[int, RadioReceiver]]:
         """Crazyflies that have a packet, and their ids on the air."""
         found = []
         for radio in heard & self._receivers.keys():
             receiver = self._receivers[radio]
             station = receiver.station
-            tuned = station.channel == channel and station.rate == rate and address in (station.address, esb.BROADCAST)
+            tuned = station.channel == channel and station.rate == rate and address in (station.address, BROADCAST)
             if tuned and self._passes(radio, True):
                 found.append((radio, receiver))
         return found
@@ -185,24 +184,24 @@ class Dongle:
         for radio in sorted(heard & self._sniffers.keys()):
             tuned = self._sniffers[radio].tuned
             if tuned is not None and (tuned.channel, tuned.rate) == (channel, rate):
-                self._sniffers[radio].hear(address, packet, frame)
+                self._sniffers[radio].receive(address, packet, frame)
 
     def _broadcast(self, address: bytes, packet: bytes, tuned: Tuned, frame: OnAir) -> None:
         """A packet that this dongle has sent in sniffer mode has left the air."""
-        heard = self._air.heard(tuned.channel, frame)
+        heard = self._air.receivers_of(tuned.channel, frame)
         self.overheard(heard, address, packet, tuned.channel, tuned.rate, frame)
-        if esb.between_crazyflies(packet):
+        if between_crazyflies(packet):
             self.between(packet, heard, tuned, frame)
         else:
             for _, receiver in self._reached(heard, tuned.channel, tuned.rate, address):
-                receiver.hear_all(packet, frame.end_ns / 1e9)
+                receiver.receive_broadcast(packet, frame.end_ns / 1e9)
 
     def _patience_ns(self, rate: str) -> int:
-        return ACK_TIMEOUT_NS if self._settings.device == "2" else esb.retry_delay_ns(self._ard, rate)
+        return ACK_TIMEOUT_NS if self._settings.device == "2" else retry_delay_ns(self._ard, rate)
 
     def _answered(self, transfer: _Transfer, reply: OnAir, radio: int, payload: bytes, channel: int, over: int) -> None:
         """The acknowledgement has left the air."""
-        heard = self._air.heard(channel, reply)
+        heard = self._air.receivers_of(channel, reply)
         self.overheard(heard, self._receivers[radio].station.address, payload, channel, transfer.rate, reply)
         if self._radio in heard and self._passes(radio, False):
             status = transfer.retries << 4 | POWER_DETECTED | ACKNOWLEDGED

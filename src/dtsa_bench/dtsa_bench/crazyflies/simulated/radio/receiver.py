@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from .settings import Station
+from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress
 
 QUEUE = 200  # packets that wait for the ground station; more are lost
 CHIP_QUEUE = 7  # of these on the radio chip; one more goes there with each packet that comes
@@ -20,15 +20,15 @@ RSSI = 45  # -dBm
 UP, DOWN = 0x08, 0x04
 
 
-class Receiver:
+class RadioReceiver:
     """Radio link of one Crazyflie; `deliver` gets each new packet, and the time (s)."""
 
-    def __init__(self, station: Station, deliver: Callable[[bytes, float], None]) -> None:
+    def __init__(self, station: RadioAddress, deliver: Callable[[bytes, float], None]) -> None:
         self.station = station
         self._deliver = deliver
         self.last_heard = float("-inf")  # s
         #: Called with the time (s) of each packet: it goes over the line to the flight processor.
-        self.taken: Callable[[float], None] = lambda t: None
+        self.on_packet: Callable[[float], None] = lambda t: None
         self._queue: deque[bytes] = deque()
         self._reset_link()
 
@@ -49,7 +49,7 @@ class Receiver:
         """Whether a packet came in the last second (t: s)."""
         return t - self.last_heard < ACTIVITY_S
 
-    def silent(self) -> None:
+    def clear(self) -> None:
         """Nobody is there: what waits is forgotten."""
         self._queue.clear()
 
@@ -63,10 +63,10 @@ class Receiver:
         """Packets that have not been fetched."""
         return len(self._queue) + len(self._chip)
 
-    def hear(self, packet: bytes, t: float) -> bytes:
+    def receive(self, packet: bytes, t: float) -> bytes:
         """A packet to its own address came at t (s); the payload of the acknowledgement."""
         header = packet[0]
-        self.taken(t)
+        self.on_packet(t)
         if len(packet) == 3 and header & MASK == NULL and packet[1] == 0x05:
             self._safelink = bool(packet[2])
             self._up = self._down = True
@@ -82,9 +82,9 @@ class Receiver:
             self._accept(packet, t)
         return self._sent
 
-    def hear_all(self, packet: bytes, t: float) -> None:
-        """A packet to all came at t (s); nobody acknowledges it."""
-        self.taken(t)
+    def receive_broadcast(self, packet: bytes, t: float) -> None:
+        """A packet to all came at t (s); it is not acknowledged."""
+        self.on_packet(t)
         self._accept(packet, t)
 
     def _accept(self, packet: bytes, t: float) -> None:

@@ -24,11 +24,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.crazyflies.simulated.fleet_config import DEVICES, RadioSettings
 
 from .air import Agenda, RadioAir
-from .dongle import Dongle
-from .receiver import Receiver
-from .settings import DEVICES, RadioSettings
+from .dongle import DongleModel
+from .receiver import RadioReceiver
 from .sniffer_mode import SnifferMode
 
 LIST, CLAIM, REQUEST, PACKET, READ, DROPPED = range(6)
@@ -38,14 +38,14 @@ _PATIENCE_S = 0.05
 
 
 @dataclass(slots=True, eq=False)
-class Host:
+class RadioHost:
     """A host's connection."""
 
     socket: socket.socket
     dongle: int | None = None
 
 
-class RadioSide:
+class RadioServer:
     """Dongles, air and receivers. Hosts may connect at once, or after `listen`.
 
     :param deliver: gets a vehicle's index, a packet for it and the time (s).
@@ -67,7 +67,7 @@ class RadioSide:
         self.agenda = Agenda()
         first = settings.dongles + 1
         self.receivers = [
-            Receiver(station, lambda packet, t, index=index: deliver(index, packet, t))  # type: ignore[misc]
+            RadioReceiver(station, lambda packet, t, index=index: deliver(index, packet, t))  # type: ignore[misc]
             for index, station in enumerate(settings.stations)
         ]
         by_id = {first + index: receiver for index, receiver in enumerate(self.receivers)}
@@ -76,20 +76,17 @@ class RadioSide:
         self.first = first
         sniffers: dict[int, SnifferMode] = {}
         self.dongles = [
-            Dongle(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up), sniffers)
+            DongleModel(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up), sniffers)
             for k in range(1, first)
         ]
         self._taken: set[int] = set()
         self._gone: set[int] = set()  # dongles that are pulled
-        self._hosts: list[Host] = []
+        self._hosts: list[RadioHost] = []
         if listen:
             self.listen()
 
     def listen(self) -> None:
-        """Hosts may connect, and the fleet's time begins.
-
-        :raises ConfigError: the socket cannot be made.
-        """
+        """Hosts may connect, and the fleet's time begins; ConfigError: the socket cannot be made."""
         self.listener = _listen(self.settings.path)
         self.origin_ns = time.monotonic_ns()
 
@@ -97,21 +94,21 @@ class RadioSide:
         """The fleet's time."""
         return time.monotonic_ns() - self.origin_ns
 
-    def take(self, host: Host | None, selector: selectors.BaseSelector) -> None:
+    def serve_host(self, host: RadioHost | None, selector: selectors.BaseSelector) -> None:
         """Receive what has come from a host (None: a new one); the selector learns of hosts that come and go."""
         if host is None:
             assert self.listener is not None
             with contextlib.suppress(OSError):
                 connection = self.listener.accept()[0]
                 connection.setblocking(False)
-                self._hosts.append(Host(connection))
+                self._hosts.append(RadioHost(connection))
                 selector.register(connection, selectors.EVENT_READ, self._hosts[-1])
             return
         sock = host.socket
         if not self._serve(host):
             selector.unregister(sock)
 
-    def _serve(self, host: Host) -> bool:
+    def _serve(self, host: RadioHost) -> bool:
         """Take what a host has sent; False when it has gone."""
         try:
             message = host.socket.recv(_LONGEST)
@@ -133,14 +130,14 @@ class RadioSide:
             self._use(self.dongles[host.dongle], host, message)
         return True
 
-    def _claim(self, host: Host, number: int) -> bool:
+    def _claim(self, host: RadioHost, number: int) -> bool:
         if number >= len(self.dongles) or number in self._taken | self._gone:
             return False
         self._taken.add(number)
         host.dongle = number
         return True
 
-    def _use(self, dongle: Dongle, host: Host, message: bytes) -> None:
+    def _use(self, dongle: DongleModel, host: RadioHost, message: bytes) -> None:
         kind = message[0]
         if kind == REQUEST and len(message) >= _REQUEST.size:
             _, number, value, index = _REQUEST.unpack_from(message)
@@ -154,7 +151,7 @@ class RadioSide:
             _send(host, struct.pack("<BI", DROPPED, dongle.sniffer.dropped))
 
     def unplug(self, number: int) -> None:
-        """Pull a dongle, of whoever has it."""
+        """Pull a dongle, whichever host has it."""
         self._gone.add(number)
         for host in self._hosts:
             if host.dongle == number:
@@ -165,7 +162,7 @@ class RadioSide:
         """All dongles are there."""
         self._gone.clear()
 
-    def leave(self, host: Host) -> None:
+    def leave(self, host: RadioHost) -> None:
         """A host goes; its dongle is free again."""
         host.socket.close()
         if host in self._hosts:
@@ -212,19 +209,19 @@ def _listen(path: Path | None) -> socket.socket:
     return listener
 
 
-def _send(host: Host, data: bytes) -> None:
+def _send(host: RadioHost, data: bytes) -> None:
     with contextlib.suppress(OSError):  # a host that has gone
         host.socket.send(data)
 
 
-class Dongles:
+class DongleServer:
     """Simulated Crazyradios on an air of their own, without Crazyflies: serves the hosts that connect to the socket.
 
     :raises ConfigError: the socket cannot be made.
     """
 
     def __init__(self, settings: RadioSettings) -> None:
-        self.side = RadioSide(settings, lambda index, packet, t: None, lambda index, up: True)
+        self.server = RadioServer(settings, lambda index, packet, t: None, lambda index, up: True)
         self._stopped = False
 
     def stop(self) -> None:
@@ -234,15 +231,15 @@ class Dongles:
     def run(self) -> None:
         """Serve until it is stopped."""
         selector = selectors.SelectSelector()  # waits to the microsecond; epoll to the millisecond
-        selector.register(self.side.listener, selectors.EVENT_READ, None)
+        selector.register(self.server.listener, selectors.EVENT_READ, None)
         try:
             while not self._stopped:
-                due = self.side.wait_s()
+                due = self.server.wait_s()
                 for key, _ in selector.select(_PATIENCE_S if due is None else min(due, _PATIENCE_S)):
-                    self.side.take(key.data, selector)
-                self.side.run()
+                    self.server.serve_host(key.data, selector)
+                self.server.run()
         finally:
             for key in list(selector.get_map().values()):
                 if key.data is not None:
-                    self.side.leave(key.data)
-            self.side.close()
+                    self.server.leave(key.data)
+            self.server.close()

@@ -1,8 +1,9 @@
 """Sniffer mode of a simulated Crazyradio 2.0: it hears all packets to two addresses, and sends without acknowledgement.
 
 Source: crazyradio2-firmware 5.4 (docs/development/compatible-usb-protocol.md, legacy_usb.c, esb.c). One thread of the
-firmware does all: it waits for a packet that was heard, a tick longer than 1 ms at most, and only in between looks
-whether there is something to send. So nobody knows when a packet leaves. While it sends, its radio hears nothing.
+firmware does all: it waits for a packet that was heard, a tick longer than 1 ms at most, and only in between checks
+whether there is something to send. So the moment when a packet leaves is unknown. While it sends, its radio hears
+nothing.
 """
 
 from __future__ import annotations
@@ -15,8 +16,7 @@ from typing import NamedTuple
 
 from dtsa_channel_sim.model.medium import OnAir
 
-from . import esb
-from .air import Agenda, RadioAir
+from .air import MAX_SNIFFED, TURN_NS, Agenda, RadioAir
 
 FIRST_FIRMWARE = 0x0504  # that has this mode
 ADDRESS = 5  # bytes before the payload of a packet that is to be sent
@@ -58,7 +58,7 @@ class SnifferMode:
         self.dropped = 0
         self._began_ns = self._deaf_ns = 0
         self._orders: deque[bytes] = deque()
-        self._heard: deque[bytes] = deque()
+        self._received: deque[bytes] = deque()
         self._wake += 1
         self._wanted = False  # the host reads
 
@@ -74,49 +74,49 @@ class SnifferMode:
             return
         self._orders.append(transfer)
         if len(self._orders) == 1:
-            self._look_at(max(now + self._half_ns, self._deaf_ns) + round(self._random.uniform(0, _POLL_NS)))
+            self._schedule_poll(max(now + self._half_ns, self._deaf_ns) + round(self._random.uniform(0, _POLL_NS)))
 
-    def _look_at(self, when: int) -> None:
+    def _schedule_poll(self, when: int) -> None:
         self._wake += 1
         number = self._wake
-        self._agenda.at(when, lambda: self._look(when) if number == self._wake else None)
+        self._agenda.at(when, lambda: self._poll(when) if number == self._wake else None)
 
-    def _look(self, now: int) -> None:
+    def _poll(self, now: int) -> None:
         """The thread looks whether there is something to send."""
         if not self._orders or self.tuned is None:
             return
         transfer = self._orders.popleft()
-        address, packet = transfer[:ADDRESS], transfer[ADDRESS:][: esb.MAX_SNIFFED]
+        address, packet = transfer[:ADDRESS], transfer[ADDRESS:][:MAX_SNIFFED]
         tuned = self.tuned
-        turn = _OFF_NS + round(self._random.uniform(0, _TICK_NS)) + esb.TURN_NS
+        turn = _OFF_NS + round(self._random.uniform(0, _TICK_NS)) + TURN_NS
         frame = self._air.send(tuned.channel, tuned.rate, self._radio, now, len(packet), turn)
         self._deaf_ns = frame.end_ns + _ON_NS
         self._agenda.at(frame.end_ns, lambda: self.arrived(address, packet, tuned, frame))
         if self._orders:
-            self._look_at(self._deaf_ns + round(self._random.uniform(0, _POLL_NS)))
+            self._schedule_poll(self._deaf_ns + round(self._random.uniform(0, _POLL_NS)))
 
     # -- hearing ----------------------------------------------------------------------------------------------------
-    def hear(self, address: bytes, packet: bytes, frame: OnAir) -> None:
+    def receive(self, address: bytes, packet: bytes, frame: OnAir) -> None:
         """A packet has left the air, and nothing has disturbed it here."""
         if self.tuned is None or address not in self.tuned.addresses or frame.air_ns < self._deaf_ns:
             return
         now = frame.end_ns
-        if len(self._heard) == QUEUE:
+        if len(self._received) == QUEUE:
             self.dropped = (self.dropped + 1) & 0xFFFFFFFF
         else:
             stamp = round((now - self._began_ns) * self._rate) // 1000 & 0xFFFFFFFF
             head = _HEAD.pack(_HEAD.size + len(packet), _RSSI, self.tuned.addresses.index(address), stamp)
-            self._heard.append(head + packet)
-            self._agenda.at(now + self._half_ns, self._tell)
+            self._received.append(head + packet)
+            self._agenda.at(now + self._half_ns, self._deliver)
         if self._orders:
-            self._look_at(now)
+            self._schedule_poll(now)
 
     def read(self) -> None:
         """The host is ready for a transfer."""
         self._wanted = True
-        self._tell()
+        self._deliver()
 
-    def _tell(self) -> None:
-        if self._wanted and self._heard and self.give is not None:
+    def _deliver(self) -> None:
+        if self._wanted and self._received and self.give is not None:
             self._wanted = False
-            self.give(self._heard.popleft())
+            self.give(self._received.popleft())

@@ -1,4 +1,4 @@
-// Every vehicle broadcasts its state at a fixed rate, whoever else sends: what the scheme `beacons` does.
+// Every vehicle broadcasts its state at a fixed rate, whether others send or not: what the scheme `beacons` does.
 #include <string.h>
 
 #include "FreeRTOS.h"

@@ -56,7 +56,7 @@ class Vehicles:
         return hard
 
 
-class World:
+class FleetMotion:
     """Vehicles that fly by their firmware; `report` gets an index, the name of an event and details."""
 
     def __init__(self, config: FleetConfig, report: Callable[..., None]) -> None:
