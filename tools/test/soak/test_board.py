@@ -45,7 +45,7 @@ ITEMS = [(fault, part, 100.0 if fault == ALL else 300.0) for fault in FAULTS for
 
 
 def _change_goals(flight: OnboardSwarm, seconds: float) -> None:
-    """Agents fly between start and target; none is report where the others fly to."""
+    """Agents fly between start and target; none knows where the others fly to."""
     places = (np.array(flight.scenario.start), np.array(flight.scenario.target))
     for turn in range(1, int((seconds - ENABLED_S) / CHANGE_S)):
         for agent in range(1, flight.swarm.agents + 1):

@@ -109,7 +109,7 @@ _LONGEST_BROADCAST = 60  # bytes between Crazyflies
 _SHORTEST_RADIO_SLOT_NS = 10_000_000  # when a frame leaves is known to 1 ms; for one more its sender is deaf
 
 
-class RadioAddress(NamedTuple):
+class DongleAddress(NamedTuple):
     """The parts of a Crazyradio's URI."""
 
     radio: str  # number of the dongle among those plugged in, from 0, or its serial number
@@ -133,7 +133,7 @@ class CrazyradioSettings(Settings):
         _parse_uri(self.uri)
 
     @property
-    def address(self) -> RadioAddress:
+    def address(self) -> DongleAddress:
         """Dongle, channel and rate."""
         return _parse_uri(self.uri)
 
@@ -152,7 +152,7 @@ class CrazyradioSettings(Settings):
         return f"{self.uri}, P2P port {self.p2p_port}"
 
 
-def _parse_uri(uri: object) -> RadioAddress:
+def _parse_uri(uri: object) -> DongleAddress:
     words = str(uri).removeprefix("radio://").split("/")
     if not str(uri).startswith("radio://") or len(words) != 3 or not (words[0].isascii() and words[0].isalnum()):
         raise ConfigError("uri", uri, _URI)
@@ -161,7 +161,7 @@ def _parse_uri(uri: object) -> RadioAddress:
         raise ConfigError("uri", uri, f"{_URI}: channel 0 to {_HIGHEST_CHANNEL}")
     if rate not in _RATES_MBPS:
         raise ConfigError("uri", uri, f"{_URI}: rate {' or '.join(_RATES_MBPS)}")
-    return RadioAddress(radio, int(channel), _RATES_MBPS[rate])
+    return DongleAddress(radio, int(channel), _RATES_MBPS[rate])
 
 
 _LINE_BITS = 10  # of a byte on the line

@@ -29,7 +29,7 @@ class EngineEvent(IntEnum):
     NONE, SEND, HEARD, COMMAND, PRINT, APP_CHANNEL, ENDED, SPINS, ASSERT, MISUSE, RECORD = range(11)
 
 
-class Command(IntEnum):
+class AppCommand(IntEnum):
     """What an app asks for (native/lab.h)."""
 
     SETPOINT, RELAX, TAKEOFF, LAND, STOP, GO_TO, ARM, RECOVER, PARAMETER, DISABLE = range(10)

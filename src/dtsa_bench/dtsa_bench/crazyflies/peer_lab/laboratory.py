@@ -29,7 +29,7 @@ from dtsa_channel_sim.model.medium import Mask, OnAir
 
 from .app import App, LabSettings
 from .compiling import compile_app, engine_library
-from .engine import AppError, AppVariables, Command, Engine, EngineEvent, decode_setpoint
+from .engine import AppCommand, AppError, AppVariables, Engine, EngineEvent, decode_setpoint
 from .polling import Polling
 from .record import Observer, PeerPacket, Record
 
@@ -172,7 +172,7 @@ class Laboratory:
             if report.code >= 0:
                 self._notify("heard", k + 1, now, packet)
         elif kind is EngineEvent.COMMAND:
-            report.answer = self._command(k, Command(report.code), data)
+            report.answer = self._command(k, AppCommand(report.code), data)
             self._notify("command", k + 1, now, (report.code, data))
             self.update_app(k)
         elif kind is EngineEvent.PRINT:
@@ -194,33 +194,33 @@ class Laboratory:
         for observer in self._observers:
             observer(kind, agent, now_ns, content)
 
-    def _command(self, k: int, command: Command, data: bytes) -> int:
+    def _command(self, k: int, command: AppCommand, data: bytes) -> int:
         firmware, t = self.motion.firmware[k], self.time
-        if command is Command.SETPOINT:
+        if command is AppCommand.SETPOINT:
             priority, setpoint = decode_setpoint(data, t, firmware.yaw)
             self.record.setpoints += 1
             firmware.offer(setpoint, priority)
             return 0
-        if command is Command.RELAX:
+        if command is AppCommand.RELAX:
             firmware.notify_stop()
             return 0
-        if command is Command.DISABLE:
+        if command is AppCommand.DISABLE:
             firmware.planner.disable()
             return 0
-        if command is Command.STOP:
+        if command is AppCommand.STOP:
             return firmware.high_level(bytes((3, 0)), t)
         values = struct.unpack(f"<{len(data) // 4}f", data)
-        if command is Command.GO_TO:
+        if command is AppCommand.GO_TO:
             return self._go_to(k, values[:3], values[3], values[4], bool(values[5]))
-        if command is Command.ARM:
+        if command is AppCommand.ARM:
             return int(firmware.supervisor.request_arming(bool(values[0])))
-        if command is Command.RECOVER:
+        if command is AppCommand.RECOVER:
             return int(firmware.supervisor.request_recovery())
-        if command is Command.PARAMETER:
+        if command is AppCommand.PARAMETER:
             self.peers[k].set_parameter(round(values[0]), values[1], t)
             return 0
         height, duration, yaw, keep = values
-        return self._rise(k, command is Command.TAKEOFF, height, duration, yaw, bool(keep))
+        return self._rise(k, command is AppCommand.TAKEOFF, height, duration, yaw, bool(keep))
 
     def _rise(self, k: int, up: bool, height: float, duration: float, yaw: float = 0.0, keep: bool = True) -> int:
         packet = struct.pack("<BBff?f", 7 if up else 8, 0, height, yaw, keep, duration)
