@@ -1,7 +1,7 @@
 """`dtsa embedded`: libdtsa on a simulated microcontroller, the same bits as here, and what calls cost.
 
 Programs: ``proofs/flight.c`` flies swarms on libdtsa alone; ``proofs/board_cost.c`` is the app on board
-(``onboard/app.c``) as it is, among agents that run ``onboard/board.c``.
+(``onboard/app.c``) as it is, among others that run the same station.
 """
 
 from __future__ import annotations

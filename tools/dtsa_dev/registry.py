@@ -58,7 +58,9 @@ The same as `pytest -m soak`. A test that fails is run again by `pytest --last-f
 
     def run(self, args: argparse.Namespace) -> int:
         """Run pytest."""
-        words = ["-m", "soak", "-k", args.k, *(["--collect-only", "-q"] if args.list else ["-v"])]
+        # Items have limits of their own, up to half an hour: what ends a test that hangs in C waits for longer.
+        words = ["-m", "soak", "-k", args.k, "-o", "faulthandler_timeout=2000"]
+        words += ["--collect-only", "-q"] if args.list else ["-v"]
         files = SOAKS.values() if args.name is None else [SOAKS[args.name]]
         environment = {**os.environ, **({"DTSA_EVIDENCE": "1"} if args.evidence and not args.list else {})}
         return subprocess.call([sys.executable, "-m", "pytest", *words, *map(str, files)], cwd=ROOT, env=environment)
