@@ -1,4 +1,7 @@
-"""`dtsa agent` and `dtsa sniff`: agents whose frames go over a network or a radio; the options that they share."""
+"""`dtsa agent` and `dtsa sniff`: agents whose frames go over a network or a radio; the options that they share.
+
+`dtsa relay`: topics of any robots over the simulated channel.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from dtsa_agent.air.port import AIRS, PortSettings, check_fits, settings_class
@@ -201,3 +205,21 @@ frames: then a lease that it does not know looks like a broken rule."""
         if sniffer.bag is not None and sniffer.bag.failure:
             raise BagError(sniffer.bag.failure)
         return 1 if summary["rules_broken"] else 0
+
+
+class RelayCommand(Command):
+    description = """\
+Topics of any robots over the shared channel: /robot1/pose comes out as /robot2/from/robot1/pose, late, or not at all.
+A YAML file names robots, topics, places and the channel. Ctrl-C ends it."""
+    examples = (("examples/relay.yaml", "two talkers that lose every fifth message"),)
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("file", type=Path, help="YAML file: robots, topics, channel")
+        parser.add_argument("--use-sim-time", action="store_true", help="time is that of /clock")
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Relay until Ctrl-C."""
+        from dtsa_channel_sim.relay import node
+
+        sim_time = f"use_sim_time:={str(args.use_sim_time).lower()}"
+        return node.main(["relay", "--ros-args", "-p", f"config:={args.file.resolve()}", "-p", sim_time])

@@ -43,7 +43,7 @@ _MODULES = {
     for module, names in {
         "fly": ("fly",),
         "demo": ("demo",),
-        "network": ("agent", "sniff"),
+        "network": ("agent", "sniff", "relay"),
         "simulation": ("simulate", "sweep"),
         "league": ("league", "new-plugin"),
         "playback": ("replay", "view"),
