@@ -1,3 +1,3 @@
 """Flights, experiments and their analysis."""
 
-__version__ = "0.1.0"  # the project's; a test compares it with those of all packages
+__version__ = "0.2.0"  # the project's; a test compares it with those of all packages
