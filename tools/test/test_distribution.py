@@ -67,7 +67,7 @@ def test_what_is_in_the_wheel_and_in_the_source(wheel: Path) -> None:
         points.read_string(file.read(f"dtsa-{version}.dist-info/entry_points.txt").decode())
     assert list(points["console_scripts"]) == ["dtsa"]
     assert len(points["dtsa.policies"]) == 15
-    assert len(points["dtsa.nodes"]) == 8
+    assert len(points["dtsa.nodes"]) == 9
     assert said["License-Expression"] == "Apache-2.0"
     notices = {name.rpartition("/")[2] for name in names if name.startswith(f"dtsa-{version}.dist-info/licenses/")}
     assert notices == {"LICENSE", "NOTICE"}
@@ -111,7 +111,7 @@ def test_colcon_builds_the_packages_of_the_workspace(tmp_path: Path) -> None:
     run(colcon, "build", "--packages-skip", "dtsa_msgs", cwd=tmp_path, **more)
     made = {str(path.relative_to(tmp_path / "install")) for path in (tmp_path / "install").glob("*/lib/dtsa_*/*")}
     assert {"dtsa_agent/lib/dtsa_agent/agent", "dtsa_channel_sim/lib/dtsa_channel_sim/channel"} <= made
-    assert len(made) == 8
+    assert len(made) == 9
     assert (tmp_path / "install/dtsa_bench/share/dtsa_bench/launch/swarm_launch.py").exists()
     paths = os.pathsep.join(map(str, (tmp_path / "install").glob("dtsa_*/lib/python3*/site-packages")))
     program = "import dtsa_agent.core._kernel as kernel; print(kernel.__file__)"
@@ -124,4 +124,4 @@ def test_release_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(release, "python", lambda version: "" if version == "3.12" else f"python{version}")
     monkeypatch.setattr(release.shutil, "which", lambda name: None)
     with pytest.raises(ConfigError, match=r"without 3.12, aarch64'; .* or --skip 3.12 --skip aarch64$"):
-        release.run(argparse.Namespace(skip=[], out="dist"))
+        release.ReleaseCommand().run(argparse.Namespace(skip=[], out="dist"))

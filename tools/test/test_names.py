@@ -1,4 +1,4 @@
-"""Names are plain engineering words, each class name stands once, files are neither tiny nor too many."""
+"""Integration: names are plain engineering words, each class name stands once, files are neither tiny nor too many."""
 
 from __future__ import annotations
 

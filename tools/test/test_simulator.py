@@ -13,7 +13,7 @@ from dtsa_dev.proofs.programs import LIBRARY, NotHere, compile_program, sources,
 
 import dtsa_agent
 
-SIMULATOR, SOCKETS = LIBRARY.parent / "libdtsa_sim", LIBRARY.parent / "air" / "udp"
+SIMULATOR, SOCKETS = LIBRARY.parent / "libdtsa_sim", LIBRARY.parent / "air"
 BINDING = Path(dtsa_agent.__file__).resolve().parents[1] / "build" / "binding" / "_kernel.c"
 FLAGS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-shared", "-fPIC")
 FLIGHTS = """

@@ -1,4 +1,4 @@
-"""The package that `new-plugin` writes works as it is."""
+"""Integration: the package that `new-plugin` writes works as it is."""
 
 from __future__ import annotations
 

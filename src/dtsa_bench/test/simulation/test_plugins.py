@@ -1,4 +1,4 @@
-"""Policies, estimators and avoiders from a package of the user's, found by entry point."""
+"""Integration: policies, estimators and avoiders from a package of the user's, found by entry point."""
 
 from __future__ import annotations
 
