@@ -1,4 +1,4 @@
-"""Integration: rules of policy lease that a slip in both statements would break alike; each statement is judged by what it sends."""
+"""Integration: rules of policy lease that a slip in both statements would break alike, judged by what is sent."""
 
 from __future__ import annotations
 
