@@ -23,7 +23,7 @@ from dtsa_bench.log.verify.result import Result
 
 PATIENCE_S = 180.0
 ENDLESS = ("--tail-s", "3600", "--no-picture")  # of simulated time, long enough to be disturbed
-_BEGUN_BYTES = 6_000  # of a bag: some slots have been recorded
+_BEGUN_BYTES = 12_000  # of a bag: definitions take 10,000, so some slots have been recorded
 _GROWTH_BYTES = 2_000
 
 
