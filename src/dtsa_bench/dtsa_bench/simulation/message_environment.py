@@ -108,7 +108,7 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         self._config = replace(self._config, seed=self._next_seed if seed is None else seed)
         self._next_seed = self._config.seed + 1
         self._transport, self._step = Transport(self._access, self._config), 0
-        self._newest = np.full((len(self._names), len(self._names)), -1)  # step in which [sender]'s known value was sent
+        self._newest = np.full((len(self._names), len(self._names)), -1)  # step of each receiver's known values
         # Payloads known, by receiver and sender: a message, or all observations of a step.
         self._known: dict[str, dict[str, Any]] = {
             name: dict.fromkeys(self._others[name], self._empty if self._space is None else self._empty[name])

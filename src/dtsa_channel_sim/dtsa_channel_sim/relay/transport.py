@@ -119,7 +119,7 @@ class Transport:
         queue = self._queues[message.sender - 1]
         self.counts["sent"][message.sender - 1] += message.receivers
         waiting = [other for other in queue if other.topic == message.topic]
-        if len(waiting) >= self.access.queue and self.access.access != "unlimited":  # there no message waits for the air
+        if len(waiting) >= self.access.queue and self.access.access != "unlimited":  # where none waits for the air
             queue.remove(waiting[0])
             self._drop(waiting[0])
         queue.append(message)
