@@ -52,7 +52,8 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         if BaseParallelWrapper is object:
             raise ConfigError("pettingzoo", None, "an installed PettingZoo (pip install pettingzoo)")
         super().__init__(env)
-        if (messages is None) == (space is None) or not (space is None or isinstance(space, Box)):
+        has_parts = space is None and isinstance(messages, Mapping | Callable)
+        if not has_parts and not (messages is None and isinstance(space, Box)):
             raise ConfigError("messages, space", (messages, space), "either messages, or a Box as space")
         self._names: list[str] = list(env.possible_agents)
         self._access, self._config = read_settings(settings, len(self._names))
@@ -67,15 +68,15 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         self._empty: dict[str, Any] = {}  # the first values known: 0, or the nearest that the space allows
         self._parts: dict[str, dict[str, Any]] = {}  # numbers of an observation that belong to each other agent
         for name, (seen, action) in self._spaces.items():
-            box = space or seen
+            box = seen if space is None else space
             if not isinstance(box, Box) or (space is None and len(box.shape) != 1):
                 allowed = "a Box of one dimension, or messages with a space"
                 raise ConfigError(f"observation_space({name!r})", box, allowed)
             self._empty[name] = np.clip(np.zeros(box.shape, box.dtype), box.low, box.high)
             if messages is None:
                 received = Dict(dict.fromkeys(self._others[name], space))
-                own = Dict({"observation": seen, "messages": received}), Dict({"action": action, "message": space})
-                self._spaces[name] = own
+                seen = Dict({"observation": seen, "messages": received})
+                self._spaces[name] = seen, Dict({"action": action, "message": space})
             else:
                 self._parts[name] = self._parts_of(name, messages)
 
@@ -85,10 +86,10 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
             part = messages(name, other) if callable(messages) else messages.get(name, {}).get(other)
             if part is None:
                 continue
-            parts[other] = part if isinstance(part, slice) else np.asarray(part)
             try:
+                parts[other] = part if isinstance(part, slice) else np.asarray(part)
                 self._empty[name][parts[other]]
-            except (IndexError, TypeError):
+            except (IndexError, TypeError, ValueError):
                 allowed = f"a slice or a list of indices below {len(self._empty[name])}"
                 raise ConfigError(f"messages[{name!r}][{other!r}]", part, allowed) from None
         return parts
