@@ -226,7 +226,7 @@ class Relay:
         """Publish counts and ages of each pair, and the state of the relay."""
         counts, robots = self._transport.counts, self._settings.robots
         missing = ", ".join(self._missing())
-        values = {"access": self._settings.access.access, "refused": ", ".join(sorted(self._refused))}
+        values: dict[str, Any] = {"access": self._settings.access.access, "refused": ", ".join(sorted(self._refused))}
         statuses = [_status("relay", f"waits for {missing}" if missing else "relays", values)]
         for sender, receiver in np.argwhere(counts["sent"]).tolist():
             sums = {name: int(counts[name][sender, receiver]) for name in COUNTS}
