@@ -53,10 +53,5 @@ def parallel_env(
 
 
 def channel(env: Any, messages: MessageMap | None = None, **more: Any) -> MessageEnv:
-    """Put a radio channel between the agents of any `ParallelEnv` of PettingZoo.
-
-    :param env: the environment.
-    :param messages: what belongs to other agents; this and all further arguments are those of :class:`MessageEnv`.
-    :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
-    """
+    """Put a radio channel between the agents of any `ParallelEnv`; arguments and errors: :class:`MessageEnv`."""
     return MessageEnv(env, messages, **more)

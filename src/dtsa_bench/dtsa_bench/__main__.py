@@ -5,11 +5,9 @@ What they need is imported when they start, so that a missing package can be nam
 
 from __future__ import annotations
 
-import atexit
-import os
 import sys
-from typing import NoReturn
 
+from dtsa_agent.stop import leave_at_once
 from dtsa_bench.commands.registry import report_missing_package
 
 
@@ -19,21 +17,8 @@ def dtsa() -> int:
 
     code = main()
     if code == INTERRUPTED or "rclpy" in sys.modules:  # the middleware's own end may wait for locks of the dead
-        _leave_at_once(code)
+        leave_at_once(code)
     return code
-
-
-def _leave_at_once(code: int) -> NoReturn:
-    """Ends this process. All files are closed; to take the interpreter apart takes seconds on a busy machine.
-
-    :param code: exit code.
-    """
-    try:
-        atexit._run_exitfuncs()
-        sys.stdout.flush()
-        sys.stderr.flush()
-    finally:
-        os._exit(code)
 
 
 def recorded_channel() -> int:

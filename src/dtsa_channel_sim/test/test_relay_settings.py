@@ -27,8 +27,8 @@ def test_a_file_says_all() -> None:
     assert settings.places == (("odometry", "odom"), ("place", (1.0, 2.0, 3.0)), ("", None))
     assert (settings.access.access, settings.channel.loss, settings.channel.slot_ns) == ("lease", 0.2, 5_000_000)
     pose, room = settings.topics
-    assert (pose.source, pose.length, pose.receivers) == ("/robot1/pose", 24, (3,))
-    assert (room.source, room.length, room.receivers, room.message_type) == ("/map", None, (2, 3), "")
+    assert (pose.source, pose.bytes, pose.receivers) == ("/robot1/pose", 24, (3,))
+    assert (room.source, room.bytes, room.receivers, room.type) == ("/map", None, (2, 3), "")
 
 
 @pytest.mark.parametrize(

@@ -25,19 +25,12 @@ _SIZE = Setting("size", "int", None, "bytes of a message", minimum=1)
 
 
 class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
-    """Any `ParallelEnv` of PettingZoo, whose agents know of each other only what a radio channel carries.
+    """Any `ParallelEnv` of PettingZoo, with a radio channel between its agents.
 
-    Either parts of observations belong to other agents (`messages`), or agents choose what they send (`space`). Every
-    agent sends one message to all others when a step begins; what has come when it ends is in the observation. For the
-    rest a receiver sees the last value received, at first 0. `infos[agent]["age"]` has how many steps ago each other
-    agent sent what is known of it, -1: nothing has come::
-
-        def of_others(agent, other):  # simple_spread of three agents: places of the others are numbers 10 to 13
-            others = [name for name in ("agent_0", "agent_1", "agent_2") if name != agent]
-            first = 10 + 2 * others.index(other)
-            return slice(first, first + 2)
-
-        env = dtsa.env.channel(simple_spread_v3.parallel_env(), of_others, loss=0.2, access="tdma", slot_ms=10)
+    Either parts of observations belong to other agents (`messages`), or agents choose what they send (`space`). Each
+    agent sends one message to all others when a step begins; what has come when it ends is in the observation, else
+    the last value received, at first 0. `infos[agent]["age"]` has how many steps ago each other agent sent what is
+    known of it, -1: nothing has come.
 
     :param env: the environment; its agents in the order of `possible_agents` have the ids 1 to N.
     :param messages: which numbers of an agent's observation, a `Box` of shape (F,), belong to which other agent: a
@@ -59,40 +52,47 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         if BaseParallelWrapper is object:
             raise ConfigError("pettingzoo", None, "an installed PettingZoo (pip install pettingzoo)")
         super().__init__(env)
-        if (messages is None) == (space is None) or not (space is None or isinstance(space, Box)):
+        has_parts = space is None and isinstance(messages, Mapping | Callable)
+        if not has_parts and not (messages is None and isinstance(space, Box)):
             raise ConfigError("messages, space", (messages, space), "either messages, or a Box as space")
         self._names: list[str] = list(env.possible_agents)
         self._access, self._config = read_settings(settings, len(self._names))
         self._step_ns, self._size = round(_STEP_MS.check(step_ms) * 1e6), _SIZE.check(size)
         self._space, self._positions, self._next_seed = space, positions, self._config.seed
         if positions is None and (self._config.needs_positions or self._access.access == "error"):
-            raise ConfigError("positions", None, "a function that says where agents are, as the channel needs it")
+            raise ConfigError("positions", None, "a function that returns where agents are, as the channel needs it")
         if fault := Transport(self._access, self._config).fault_of(size):
             raise ConfigError("size", size, f"what can be sent: {fault}")
+        self._others = {name: [other for other in self._names if other != name] for name in self._names}
         self._spaces = {name: (env.observation_space(name), env.action_space(name)) for name in self._names}
-        for name, (seen, act) in self._spaces.items() if space is not None else ():
-            others = Dict({other: space for other in self._names if other != name})
-            spaces = Dict({"observation": seen, "messages": others}), Dict({"action": act, "message": space})
-            self._spaces[name] = spaces
-        self._owners = {name: self._owners_in(name, messages) for name in self._names if space is None}
+        self._empty: dict[str, Any] = {}  # the first values known: 0, or the nearest that the space allows
+        self._parts: dict[str, dict[str, Any]] = {}  # numbers of an observation that belong to each other agent
+        for name, (seen, action) in self._spaces.items():
+            box = seen if space is None else space
+            if not isinstance(box, Box) or (space is None and len(box.shape) != 1):
+                allowed = "a Box of one dimension, or messages with a space"
+                raise ConfigError(f"observation_space({name!r})", box, allowed)
+            self._empty[name] = np.clip(np.zeros(box.shape, box.dtype), box.low, box.high)
+            if messages is None:
+                received = Dict(dict.fromkeys(self._others[name], space))
+                seen = Dict({"observation": seen, "messages": received})
+                self._spaces[name] = seen, Dict({"action": action, "message": space})
+            else:
+                self._parts[name] = self._parts_of(name, messages)
 
-    def _owners_in(self, name: str, messages: Any) -> NDArray[np.intp]:
-        """Return the row of the agent that owns each number of an observation, N: the agent itself, (F,)."""
-        box = self.env.observation_space(name)
-        if not isinstance(box, Box) or len(box.shape) != 1:
-            raise ConfigError(f"observation_space({name!r})", box, "a Box of one dimension, or messages with a space")
-        owners = np.full(box.shape, len(self._names), np.intp)
-        for row, other in enumerate(self._names):
-            if other == name:
-                continue
+    def _parts_of(self, name: str, messages: MessageMap) -> dict[str, Any]:
+        parts = {}
+        for other in self._others[name]:
             part = messages(name, other) if callable(messages) else messages.get(name, {}).get(other)
-            if part is not None:
-                try:
-                    owners[part] = row
-                except (IndexError, TypeError):
-                    allowed = f"a slice or a list of indices below {box.shape[0]}"
-                    raise ConfigError(f"messages[{name!r}][{other!r}]", part, allowed) from None
-        return owners
+            if part is None:
+                continue
+            try:
+                parts[other] = part if isinstance(part, slice) else np.asarray(part)
+                self._empty[name][parts[other]]
+            except (IndexError, TypeError, ValueError):
+                allowed = f"a slice or a list of indices below {len(self._empty[name])}"
+                raise ConfigError(f"messages[{name!r}][{other!r}]", part, allowed) from None
+        return parts
 
     def observation_space(self, agent: str) -> Any:
         """That of the environment; with a space: a ``Dict`` of its ``observation`` and ``messages`` by agent."""
@@ -105,18 +105,14 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begin an episode; without a seed, the losses take the one after that of the last episode."""
+        """Begin an episode; without a seed, that of the losses is one more than in the last episode."""
         self._config = replace(self._config, seed=self._next_seed if seed is None else seed)
         self._next_seed = self._config.seed + 1
-        self._channel, self._step = Transport(self._access, self._config), 0
-        self._newest = np.full((len(self._names), len(self._names)), -1)  # step of what [receiver] has of [sender]
-        # Nothing has been received: 0, or the nearest that the space allows.
-        boxes = {name: self._space or self.env.observation_space(name) for name in self._names}
-        empty = {name: np.clip(np.zeros(box.shape, box.dtype), box.low, box.high) for name, box in boxes.items()}
-        self._known: dict[str, Any] = {
-            name: empty[name]
-            if self._space is None
-            else {other: empty[other] for other in self._names if other != name}
+        self._transport, self._step = Transport(self._access, self._config), 0
+        self._newest = np.full((len(self._names), len(self._names)), -1)  # step of each receiver's known values
+        # Payloads known, by receiver and sender: a message, or all observations of a step.
+        self._known: dict[str, dict[str, Any]] = {
+            name: dict.fromkeys(self._others[name], self._empty if self._space is None else self._empty[name])
             for name in self._names
         }
         return self._exchange(*self.env.reset(seed=seed, options=options), {})
@@ -127,37 +123,43 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         if self._space is not None:
             sent = {name: np.array(action["message"]) for name, action in actions.items()}
             actions = {name: action["action"] for name, action in actions.items()}
-        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        observations, *outcome, infos = self.env.step(actions)
         observations, infos = self._exchange(observations, infos, sent)
-        return observations, rewards, terminations, truncations, infos
+        return observations, *outcome, infos
 
     def _exchange(
         self, observations: dict[str, Any], infos: dict[str, Any], sent: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Send what is new, let a step pass, and return observations and infos with what has arrived."""
-        step, now_ns = self._step, self._step * self._step_ns
+        """Send the messages of a step, let it pass, and return observations and infos with what was received."""
+        step, now_ns, names = self._step, self._step * self._step_ns, self._names
         self._step += 1
-        present = np.array([name in observations for name in self._names])
-        for row, name in enumerate(self._names):
-            if name in (observations if self._space is None else sent):
-                receivers = present & (np.arange(len(present)) != row)
-                payload = observations if self._space is None else sent[name]
-                self._channel.send(RadioMessage(row + 1, "", step, self._size, now_ns, receivers, payload))
-        for message, received in self._channel.advance(now_ns + self._step_ns, self._places()):
-            self._accept(message, received)
-        shown: dict[str, Any] = {}  # another dictionary: what is on the air stays as it is
+        if self._space is None:
+            copies = {name: np.array(values) for name, values in observations.items()}
+            sent = dict.fromkeys(copies, copies)
+        present = np.array([name in observations for name in names])
+        for row, name in enumerate(names):
+            if name in sent:
+                self._transport.send(RadioMessage(row + 1, "", step, self._size, now_ns, present, sent[name]))
+        for message, received in self._transport.advance(now_ns + self._step_ns, self._places()):
+            column = message.sender - 1
+            newer = received & (self._newest[:, column] < message.number)
+            self._newest[newer, column] = message.number
+            for row in np.flatnonzero(newer).tolist():
+                self._known[names[row]][names[column]] = message.payload
+        completed: dict[str, Any] = {}
+        for name, own in observations.items():
+            if self._space is not None:
+                completed[name] = {"observation": own, "messages": dict(self._known[name])}
+                continue
+            completed[name] = np.array(own)
+            for other, part in self._parts[name].items():
+                completed[name][part] = self._known[name][other][name][part]
         ages = np.where(self._newest < 0, -1, step - self._newest).tolist()
-        for row, name in enumerate(self._names):
-            if name in observations and self._space is None:
-                fresh = np.append(self._newest[row] == step, True)[self._owners[name]]
-                self._known[name] = shown[name] = np.where(fresh, observations[name], self._known[name])
-            elif name in observations:
-                shown[name] = {"observation": observations[name], "messages": dict(self._known[name])}
+        for name, row in zip(names, ages, strict=True):
             if name in infos:
-                age = dict(zip(self._names, ages[row], strict=True))
-                del age[name]
+                age = {other: age for other, age in zip(names, row, strict=True) if other != name}
                 infos[name] = {**infos[name], "age": age}
-        return shown, infos
+        return completed, infos
 
     def _places(self) -> NDArray[np.float64] | None:
         """Return where agents are, (3, N), m."""
@@ -167,16 +169,3 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         if given.shape not in ((len(self._names), 2), (len(self._names), 3)):
             raise ConfigError("positions", f"shape {given.shape}", f"({len(self._names)}, 2) or (.., 3), m")
         return np.pad(given.T, ((0, 3 - given.shape[1]), (0, 0)))
-
-    def _accept(self, message: RadioMessage, received: NDArray[np.bool_]) -> None:
-        """Let the receivers of a message know what is in it, unless they have a newer one."""
-        column = message.sender - 1
-        news = received & (self._newest[:, column] < message.number)
-        self._newest[news, column] = message.number
-        for row in np.flatnonzero(news).tolist():
-            name = self._names[row]
-            if self._space is not None:
-                self._known[name][self._names[column]] = message.payload
-            elif message.number < self._step - 1 and name in message.payload:  # newer ones are in the observations
-                owned = self._owners[name] == column
-                self._known[name] = np.where(owned, message.payload[name], self._known[name])

@@ -141,7 +141,8 @@ def test_losses_go_by_the_seed_and_distance_counts() -> None:
     [({"loss": 2}, "loss"), ({"step_ms": 0}, "step_ms"), ({"size": 0}, "size"), ({"range_m": 5}, "positions"),
      ({"size": 100, "access": "tdma", "slot_ms": 0.3}, "size"), ({"messages": None}, "messages, space"),
      ({"messages": lambda a, b: [99]}, "messages['agent_0']['agent_1']"),
-     ({"space": 3, "messages": None}, "messages, space")],
+     ({"space": 3, "messages": None}, "messages, space"), ({"messages": 3}, "messages, space"),
+     ({"messages": lambda a, b: [[1], [1, 2]]}, "messages['agent_0']['agent_1']")],
 )  # fmt: skip
 def test_bad_settings_are_named(settings: dict[str, Any], field: str) -> None:
     with pytest.raises(ConfigError) as caught:

@@ -265,7 +265,7 @@ class Air(Generic[Key]):
 
 
 class ListeningRule(Protocol):
-    """When a radio that listens may begin: a policy, or the carrier sense of the relay."""
+    """When a radio that listens may begin: a policy."""
 
     @property
     def name(self) -> str:
