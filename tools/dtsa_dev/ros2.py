@@ -33,6 +33,8 @@ def main(words: list[str]) -> int:
             case ["run", package, executable, *rest] if (package, executable) in nodes:
                 sys.argv = [executable, *rest]
                 return int(nodes[package, executable].load()() or 0)
+            case ["run", package, executable, *_]:
+                raise LookupError(f"run: there is no {package} {executable} here; see `ros2 pkg executables`")
             case ["pkg", "executables"]:
                 print("\n".join(sorted(" ".join(name) for name in nodes)))
             case ["interface", "show", name]:

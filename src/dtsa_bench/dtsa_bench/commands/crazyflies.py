@@ -289,7 +289,7 @@ def _lines(summary: dict[str, Any], printed: int) -> str:
         ("nearest", "fewer than two flew" if near is None
          else f"{near:.3f} m (agents {pair} at {summary['min_distance_time_s']:.2f} s)"),
         ("crashed", f"{len(summary['crashed'])}/{summary['agents']}" + "".join(f" {k}" for k in summary["crashed"])),
-        ("printed", f"{printed} lines"),
+        ("console", f"{printed} lines printed by the apps"),
         ("digest", summary["digest"]),
     )  # fmt: skip
     return "\n".join(f"{name:<9} {text}" for name, text in rows)

@@ -288,7 +288,13 @@ class LeagueTable:
             if name in names[:number]:
                 raise ConfigError("FILE", name, "every name once; `league enter --name` gives another one")
             if flown[number] != flown[0] or not any(flown[0].values()):
-                raise ConfigError("FILE", name, f"entries with flights, in the same cells and as many as {names[0]}")
+                most, fewest = sorted((0, number), key=lambda each: sum(flown[each].values()), reverse=True)
+                raise ConfigError(
+                    "FILE",
+                    names[fewest],
+                    f"entries with flights, in the same cells and as many as {names[most]}; "
+                    "`league enter` without --cells and --sample flies all",
+                )
         self.league = the_league
         self.cells = [cell for cell in the_league.cells if flown[0].get(cell)]
         total = {entry["name"]: scores(the_league, entry["flights"]) for entry in entries}

@@ -122,13 +122,15 @@ class AgentRecorder:
     """The bag of one agent, written while it flies: a watcher of the agent.
 
     :param goals_told: the agent is told goals in flight, beside those of the scenario: none is known to be its last.
+    :param started_ns: when the agent began, by its own clock; None: now.
     :raises BagError: if the file cannot be made.
     """
 
     def __init__(
-        self, path: Path, own: AgentSettings, config: SwarmConfig, port: PortSettings, goals_told: bool = False
-    ) -> None:
-        started = monotonic_ns() + own.clock_offset_ns  # own clock
+        self, path: Path, own: AgentSettings, config: SwarmConfig, port: PortSettings, goals_told: bool = False,
+        started_ns: int | None = None,
+    ) -> None:  # fmt: skip
+        started = monotonic_ns() + own.clock_offset_ns if started_ns is None else started_ns
         about = {
             "id": own.id, "started_ns": started, "zero_ns": started - names.TIME_ZERO_NS, "goals_told": goals_told,
             "own": own.to_dict(), "port": dataclasses.asdict(port.properties), "port_settings": port.to_dict(),

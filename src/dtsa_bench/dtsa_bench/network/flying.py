@@ -98,10 +98,11 @@ def brief(summary: Mapping[str, Any]) -> str:
     def reasons(counts: Mapping[str, int]) -> str:
         return ", ".join(f"{count} {reason}" for reason, count in counts.items())
 
+    early, later = summary["held_at_start_slots"], summary["held_slots"]
     share, late = summary["heard_share"], summary["send_late_ms"]["p99"]
     rows = {
         "state": f"{summary['state']}, {summary['slots']} slots of {summary['slot_ms']:g} ms",
-        "hovered": f"{summary['held_at_start_slots']} slots before it flew, {summary['held_slots']} after",
+        "hovered": f"without a quorum {early} slots before it flew, {later} after",
         "sent": f"{summary['sent']} frames" + (f", at most {late:.2f} ms late (99 %)" if late is not None else ""),
         "not sent": reasons(summary["unsent_because"]),
         "heard": f"{summary['heard']} frames of {', '.join(f'cf{agent}' for agent in summary['heard_of']) or 'nobody'}"

@@ -43,7 +43,8 @@ class _AgentFlight:
     """What one agent has noted, and its bag."""
 
     def __init__(self, agent: int, config: SwarmConfig, path: Path) -> None:
-        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _PeerPort(), not config.targets_known)
+        goals_told, started_ns = not config.targets_known, 0  # the vehicle's clock begins when it is switched on
+        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _PeerPort(), goals_told, started_ns)
         self._record: SlotRecord | None = None
         self._before: list[ReceivedFrame] = []
         self._slots = config.steps
