@@ -3,6 +3,8 @@
 Run it by `tools/dtsa shell -c "python examples/talkers.py"`. Ctrl-C ends it.
 """
 
+import contextlib
+
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import String
@@ -26,10 +28,8 @@ def main() -> None:
         topic = f"/{robot}/from/{other}/chatter"
         node.create_subscription(String, topic, lambda message, topic=topic: print(topic, message.data, flush=True), 10)
     node.create_timer(0.5, send)
-    try:
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
 
 
 if __name__ == "__main__":
