@@ -35,7 +35,7 @@ from dtsa_agent.ros.common.node_process import follow_supervisor, init_ros, limi
 from dtsa_agent.ros.common.parameters import check_parameters, declare_settings
 
 from .interfaces import NODE
-from .preflight import FAIL, preflight
+from .preflight import FAIL, check_preflight
 from .topics import BridgeInputs, BridgeOutputs, helper_node, subscribe_positions
 
 STATUS_HZ = 5.0
@@ -194,7 +194,7 @@ def check_node(node: BridgeNode, print_line: Callable[[str], None]) -> int:
     node.bridge.connect(stop=interrupts.any)
     interrupts.wait(SETTLE_S)  # rates and qualities are counted over a second
     firmware = {v.name: v.link.firmware for v in node.bridge.vehicles.values() if v.link.firmware is not None}
-    findings = preflight(node.settings, node.bridge.snapshots(), firmware, node.bridge.radios, problem)
+    findings = check_preflight(node.settings, node.bridge.snapshots(), firmware, node.bridge.radios, problem)
     node.bridge.close()
     for finding in findings:
         print_line(str(finding))
