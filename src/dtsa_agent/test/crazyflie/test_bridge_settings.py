@@ -165,7 +165,7 @@ def test_files_of_laboratories_are_taken_as_they_are(robots: list[Any], ids: dic
 
 def test_keys_that_mean_nothing_here_are_named_once() -> None:
     file = laboratory(("cf1", RADIO, {"colour": 1, "battery": {"chemistry": "LiPo"}}), ("cf2", "usb://0", {}))
-    (line,) = [line for line in parse_swarm(file | {"relative": False}).summary() if "not used" in line]
+    (line,) = [line for line in parse_swarm(file | {"relative": False}).describe() if "not used" in line]
     for key in ("relative", "robots.cf1.colour", "robots.cf1.battery.chemistry", "all.broadcasts"):
         assert line.count(key) == 1
     assert line.count("robot_types.cf21.big_quad") == 1  # of both robots

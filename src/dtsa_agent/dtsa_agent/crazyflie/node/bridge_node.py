@@ -75,7 +75,7 @@ class BridgeNode(Node):
         self.bridge = Bridge(self.settings, self.log, self.outputs.publish_state)
         self.command_thread = CommandThread(helper_node(self, "commands"))
         self._inputs = BridgeInputs(self, self.bridge, self.command_thread, self.log)
-        self.positions = CommandThread(helper_node(self, "positions")) if positions.on else None
+        self.positions = CommandThread(helper_node(self, "positions")) if positions.enabled else None
         if self.positions is not None:
             subscribe_positions(self.positions, positions, self.bridge.vehicles)
 
@@ -115,7 +115,7 @@ class BridgeNode(Node):
             self.log("warn", f"not connected: {', '.join(missing)} (service reconnect)")
         if self.bridge.connected < self.settings.station.min_connected:
             return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
-        if self.settings.station.on_board.on:
+        if self.settings.station.on_board.enabled:
             if problem := self.bridge.start_agents():
                 return problem
             rate = self.settings.station.on_board.polls_hz

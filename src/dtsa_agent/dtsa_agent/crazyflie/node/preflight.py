@@ -116,20 +116,22 @@ def _positions(settings: SwarmSettings, connected: ConnectedVehicles) -> Lines:
             yield FAIL, f"{s.name}: not finite {where}"
         elif offsets[-1] > MAX_START_OFFSET_M:
             yield WARN, f"{s.name}: at {where} in the world, {offsets[-1]:.2f} m from its initial_position"
-        if s.tracker is not None and s.tracker.rate(now) == 0.0:
+        if s.tracker is not None and s.tracker.rate_hz(now) == 0.0:
             yield FAIL, f"{s.name}: not seen by motion capture {s.tracker.reason}".rstrip()
     if not connected:
         yield FAIL, "unknown: no Crazyflie is connected"
-    rates = [s.tracker.rate(now) for s, _ in connected if s.tracker is not None]
+    rates = [s.tracker.rate_hz(now) for s, _ in connected if s.tracker is not None]
     capture = f"; motion capture at {min(rates):.0f} to {max(rates):.0f} Hz" if rates else ""
     yield OK, f"at most {max(offsets):.2f} m from the initial positions{capture}"
 
 
 def _clocks(settings: SwarmSettings, connected: ConnectedVehicles) -> Lines:
-    if not settings.station.positions.on:
+    if not settings.station.positions.enabled:
         yield OK, "one clock, the station's: there is no motion capture"
         return
-    ages = {s.name: s.tracker.latency(0.5) for s, _ in connected if s.tracker is not None and s.tracker.latencies}
+    ages = {
+        s.name: s.tracker.latency_quantile(0.5) for s, _ in connected if s.tracker is not None and s.tracker.latencies
+    }
     for name, age in ages.items():
         if not MIN_POSE_AGE_S <= age <= MAX_POSE_AGE_S:
             yield WARN, f"{name}: poses are {age * 1000:.1f} ms old when they are sent: late, or another clock's"
