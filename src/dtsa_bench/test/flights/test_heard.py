@@ -53,10 +53,10 @@ class Initials:
     def estimate(self, table, slot, step, position, velocity):
         position[:], velocity[:] = table.sent_position, table.sent_velocity
 
-    def say(self, table, slot):
+    def own_data(self, table, slot):
         return bytes([65 + table.agent, 97 + slot % 26])
 
-    def heard(self, table, slot, sender, data):
+    def receive_data(self, table, slot, sender, data):
         assert data == bytes([65 + sender, 97 + slot % 26]), (slot, sender, data)
 '''
 # Options, and the bytes that policy and estimator append to a frame.
