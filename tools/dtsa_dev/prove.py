@@ -17,9 +17,9 @@ _SPEED = "-O2"
 ANY = -1  # any number of times
 # Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody, also when it is
 # handed on), and which are OPEN.
-_CHOICE, _FREE_CHOICE = "(choose_lessee(v, who, turn) + 1)", "(prove_lessee(who->able, v->n) + 1)"
-_OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, who, turn)", "mine && prove_open()"
-_NEXT, _FREE_NEXT = "choose_next(v, &who, idle, turn)", "prove_next(who.able, v->self, v->n)"
+_CHOICE, _FREE_CHOICE = "(choose_lessee(v, candidates, turn) + 1)", "(prove_lessee(candidates->able, v->n) + 1)"
+_OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, candidates, turn)", "mine && prove_open()"
+_NEXT, _FREE_NEXT = "choose_next_lessee(v, &candidates, idle, turn)", "prove_next(candidates.able, v->self, v->n)"
 _LAST, _EACH = "turn < last + !idle;", "turn <= last;"
 _REACH = "RELAY_REACH = 24"
 _HEADER = '#include "lease.h"\n'
