@@ -362,9 +362,9 @@ def _notes(about: Mapping[str, Any], results: Any) -> list[str]:
             notes.append(text.format(", ".join(f"cf{one}" if isinstance(one, int) else str(one) for one in about[key])))
     if len(results):
         notes.append(
-            f"Results are those of slots {results[0]} to {results[-1]}: from when nobody was on probation until "
+            f"Results are those of slots {results[0]} to {results[-1]}: from when no agent was on probation until "
             "the first agent ended. Completion time counts from there."
         )
     else:
-        notes.append("There are no results: at no time had all been heard, with nobody on probation.")
+        notes.append("There are no results: at no time had all agents been heard, and none was on probation.")
     return notes

@@ -143,7 +143,7 @@ class BridgeInputs:
         """Give an order to those that are addressed (group 0: to all of them; else to those in one of these groups)."""
         members = [name for name in names if not group or self._masks[name] & group]
         if not members:
-            return False, f"nobody of {', '.join(names)} is in a group of {group}"
+            return False, f"none of {', '.join(names)} is in a group of {group}"
         return self._bridge.order_each(members, order)
 
     def _refuse(self, names: list[str], request: Any) -> tuple[bool, str]:
