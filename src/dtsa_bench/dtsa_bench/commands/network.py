@@ -146,7 +146,7 @@ environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
             nargs="?",
             const="0",
             metavar="SECONDS",
-            help="does not fly: reports which agents hear each other, and in time; exit code 0: all hear all [until all know]",
+            help="no flight: reports which agents hear each other in time; exit code 0: all hear all [until all know]",
         )
         add_network_options(parser)
 

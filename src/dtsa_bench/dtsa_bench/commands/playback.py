@@ -182,7 +182,7 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
             from .network import read_network_options
 
             settings, config = read_network_options(args)
-            history = RunHistory(settings.where)
+            history = RunHistory(settings.destination)
             source = NetworkListener(history, config, settings)
         else:
             from dtsa_agent.ros.common import names

@@ -56,7 +56,7 @@ class PairKnowledge:
         if log.heard is None:
             return
         for k in range(log.heard_ends[row], log.heard_ends[row + 1]):
-            for column in np.flatnonzero(log.heard.by[k]).tolist():
+            for column in np.flatnonzero(log.heard.receivers[k]).tolist():
                 pair, slot = (column + 1, int(log.heard.sender[k])), int(log.heard.slot[k])
                 self._heard[pair] = max(slot, self._heard.get(pair, slot))
 

@@ -220,7 +220,7 @@ class FramesOnAir:
         taken_in: dict[tuple[int, int], Mask] = {}
         delays, count = Delays(self.config.agents), 0
         for k, (slot, sender) in enumerate(zip(heard.slot.tolist(), heard.sender.tolist(), strict=True)):
-            sent, by = self._sent.get((slot, sender)), heard.by[k]
+            sent, by = self._sent.get((slot, sender)), heard.receivers[k]
             if sent is None:
                 if slot >= slots:
                     continue
