@@ -183,7 +183,7 @@ def radio_loads(users: Iterable[RadioUser]) -> list[RadioLoad]:
             anywhere = f" on channel {user.address.channel}" if user.address.radio == ANY else ""
             dongles.setdefault(f"radio {user.address.radio}{anywhere}", []).append(user)
             channels.setdefault(user.address.channel, []).append(user)
-    loads = [_load(medium, dongles[where]) for where in sorted(dongles)]
+    loads = [_load(medium, dongles[medium]) for medium in sorted(dongles)]
     for channel, sharing in sorted(channels.items()):
         radios = sorted({user.address.radio for user in sharing})
         if len(radios) > 1:
