@@ -176,7 +176,7 @@ def test_bytes_that_do_not_fit_are_refused_and_broken_promises_named(monkeypatch
     assert config(frame="extended", estimator="linear").own_bytes == 4
     with pytest.raises(ConfigError, match="own_bytes of counting: got 4; allowed: 0 to 0"):
         config(frame="extended", estimator="linear", auth=True)
-    monkeypatch.setattr(Counting, "say", lambda self, table, slot: b"abc")
+    monkeypatch.setattr(Counting, "own_data", lambda self, table, slot: b"abc")
     swarm = make_swarm(config())
     with pytest.raises(PluginError, match="policy counting, own_data: gave 3 bytes, declared 4"):
         swarm.begin(0)
