@@ -130,7 +130,10 @@ MUTANTS = (
         "== agent->self && lease_is_main(", "== agent->self && lease_is_anchor(",
         _RESTS,
     ),
-    Mutant("OPEN turns are for agents that wake", "lease.c", "if (v->a->woke < 0 || has_own_turn", "if (has_own_turn", _OPEN),
+    Mutant(
+        "OPEN turns are for agents that wake", "lease.c",
+        "if (v->a->woke < 0 || has_own_turn", "if (has_own_turn", _OPEN,
+    ),
     Mutant(
         "an agent that hears itself claimed goes into probation", "lease.c", "distance <= e->c_s || ", "", _ADOPTS,
     ),
