@@ -17,9 +17,9 @@ _SPEED = "-O2"
 ANY = -1  # any number of times
 # Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody, also when it is
 # handed on), and which are OPEN.
-_CHOICE, _FREE_CHOICE = "(choose_lessee(v, who, turn) + 1)", "(prove_lessee(who->able, v->n) + 1)"
-_OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, who, turn)", "mine && prove_open()"
-_NEXT, _FREE_NEXT = "choose_next(v, &who, idle, turn)", "prove_next(who.able, v->self, v->n)"
+_CHOICE, _FREE_CHOICE = "(choose_lessee(v, candidates, turn) + 1)", "(prove_lessee(candidates->able, v->n) + 1)"
+_OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, candidates, turn)", "mine && prove_open()"
+_NEXT, _FREE_NEXT = "choose_next_lessee(v, &candidates, idle, turn)", "prove_next(candidates.able, v->self, v->n)"
 _LAST, _EACH = "turn < last + !idle;", "turn <= last;"
 _REACH = "RELAY_REACH = 24"
 _HEADER = '#include "lease.h"\n'
@@ -54,10 +54,10 @@ class Scope:
 
 
 @dataclass(frozen=True, slots=True)
-class Explored:
+class Exploration:
     """What an exploration found."""
 
-    world: Scope
+    scope: Scope
     broken: str  # the rule; empty: all hold in all states that were reached
     states: int
     depth: int  # slots from the start
@@ -66,7 +66,7 @@ class Explored:
 
 _ONCE = {"restarts": 1, "deaths": 1, "returns": 1}
 _NEVER = {"restarts": 0, "deaths": 0, "returns": 0, "claims": 0}
-WORLDS = (
+SCOPES = (
     Scope("two agents", 2),
     Scope("two agents, OPEN turns", 2, open_every=3),
     Scope("two agents, adoption", 2, adoption=True),
@@ -90,13 +90,13 @@ WORLDS = (
 
 @dataclass(frozen=True, slots=True)
 class Mutant:
-    """One rule of the protocol broken, and a world in which that shows."""
+    """One rule of the protocol broken, and a scope in which that shows."""
 
     rule: str
     file: str  # below policy/lease
     right: str
     wrong: str
-    world: Scope
+    scope: Scope
 
 
 _PLAIN, _RESTART = Scope("plain", 2, restarts=0, deaths=0), Scope("restart", 2, restarts=1, deaths=0)
@@ -130,7 +130,10 @@ MUTANTS = (
         "== agent->self && lease_is_main(", "== agent->self && lease_is_anchor(",
         _RESTS,
     ),
-    Mutant("OPEN turns are for agents that wake", "lease.c", "if (v->a->woke < 0 || own_right", "if (own_right", _OPEN),
+    Mutant(
+        "OPEN turns are for agents that wake", "lease.c",
+        "if (v->a->woke < 0 || has_own_turn", "if (has_own_turn", _OPEN,
+    ),
     Mutant(
         "an agent that hears itself claimed goes into probation", "lease.c", "distance <= e->c_s || ", "", _ADOPTS,
     ),
@@ -159,7 +162,7 @@ class ProveCommand(Command):
     description = """\
 Runs libdtsa's own code for policy lease through the states that two or three agents can reach, for all patterns of
 loss, and checks the protocol's invariants in each; then breaks one rule at a time and sees that the search finds it."""
-    examples = (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only"))
+    examples = (("", "all scopes, then the broken rules"), ("--mutants", "the broken rules only"))
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--mutants", action="store_true", help="the broken rules only")
@@ -170,13 +173,13 @@ loss, and checks the protocol's invariants in each; then breaks one rule at a ti
 
         failed = 0
         with tempfile.TemporaryDirectory() as directory:
-            for world in () if args.mutants else WORLDS:
-                result = explore(build(Path(directory), relay_reach=world.relay_reach), world)
+            for scope in () if args.mutants else SCOPES:
+                result = explore(build(Path(directory), relay_reach=scope.relay_reach), scope)
                 failed += bool(result.broken)
                 end = result.broken or ("all states" if result.closed else "holds so far, not all states")
-                print(f"{world.name:62} {result.states:9} states, depth {result.depth:3}: {end}", flush=True)
+                print(f"{scope.name:62} {result.states:9} states, depth {result.depth:3}: {end}", flush=True)
             for mutant in MUTANTS:
-                result = explore(build(Path(directory), mutant), mutant.world)
+                result = explore(build(Path(directory), mutant), mutant.scope)
                 failed += not result.broken
                 print(f"without {mutant.rule!r}: {result.broken or 'NOT FOUND'}; {result.states} states", flush=True)
         return 1 if failed else 0
@@ -216,11 +219,11 @@ def _replace(path: Path, right: str, wrong: str) -> None:
     path.write_text(text.replace(right, wrong), encoding="utf-8")
 
 
-def explore(program: Path, world: Scope, limit_s: float = 3600.0) -> Explored:
-    """Explore a world, within a limit of wall-clock time."""
-    command = [str(program), *world.words()]
+def explore(program: Path, scope: Scope, limit_s: float = 3600.0) -> Exploration:
+    """Explore a scope, within a limit of wall-clock time."""
+    command = [str(program), *scope.words()]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit_s)
     match = re.search(r"(?:broken (.*); )?states (\d+) depth (\d+)(.*)", done.stdout)
     if match is None:
         raise DtsaError(f"prove: exit code {done.returncode}: {(done.stdout + done.stderr).strip()[-300:]}")
-    return Explored(world, match[1] or "", int(match[2]), int(match[3]), "closed" in match[4])
+    return Exploration(scope, match[1] or "", int(match[2]), int(match[3]), "closed" in match[4])

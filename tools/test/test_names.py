@@ -53,8 +53,6 @@ BANNED_AS_NOUNS = {
         ("other", "until", "again", "work", "world", "take", "hold", "one"), ("names nothing", "a noun of the field")
     ),
 }
-#: Methods whose names others have chosen: argparse; radios of plug-ins.
-FOREIGN = {"say"}
 #: Classes of one interface: the specification in `core/reference` has the names of what it specifies.
 INTERFACES = {"Agent", "Station"}
 SMALL = 60  # lines; a smaller file joins its only user
@@ -102,7 +100,7 @@ def test_names_are_plain() -> None:
                 faults += [f"{path}: {node.name}: {fault}" for fault in wrong(node.name, BANNED)]
                 noun = tokens(node.name)[-1]
                 faults += [f"{path}: {node.name}: {fault}" for fault in wrong(noun, BANNED_AS_NOUNS)]
-            elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.name not in FOREIGN:
+            elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                 faults += [f"{path}: {node.name}: {fault}" for fault in wrong(node.name, BANNED)]
     assert not faults, "\n".join(faults)
 

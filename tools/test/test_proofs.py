@@ -102,8 +102,8 @@ def test_code_for_software_doubles_gives_the_same_bits(tmp_path: Path) -> None:
 def test_every_state_of_three_agents_keeps_the_rules(adoption: bool, tmp_path: Path) -> None:
     """Through a restart, a death and what it leads to, for all patterns of loss."""
     claims = 1 if adoption else 0
-    world = Scope("three agents", 3, adoption=adoption, restarts=1, deaths=1, returns=0, claims=claims)
-    whole = explore(build_prover(tmp_path), world)
+    scope = Scope("three agents", 3, adoption=adoption, restarts=1, deaths=1, returns=0, claims=claims)
+    whole = explore(build_prover(tmp_path), scope)
     assert whole.closed
     assert not whole.broken
     assert whole.states > 1_000
@@ -111,16 +111,16 @@ def test_every_state_of_three_agents_keeps_the_rules(adoption: bool, tmp_path: P
 
 def test_anchors_that_are_given_away_keep_the_rules(tmp_path: Path) -> None:
     """OPEN turns, adoption, a restart, a wrong claim; one anchor in two is a main one."""
-    world = Scope(
+    scope = Scope(
         "two agents", 2, anchor_rest=2, open_every=3, adoption=True, restarts=1, deaths=0, returns=0, claims=1
     )
-    whole = explore(build_prover(tmp_path), world)
+    whole = explore(build_prover(tmp_path), scope)
     assert whole.closed
     assert not whole.broken
     assert whole.states > 1_000
 
 
 def test_every_broken_rule_is_found(tmp_path: Path) -> None:
-    found = {mutant.rule: explore(build_prover(tmp_path, mutant), mutant.world).broken for mutant in MUTANTS}
+    found = {mutant.rule: explore(build_prover(tmp_path, mutant), mutant.scope).broken for mutant in MUTANTS}
     assert all(found.values()), [rule for rule, broken in found.items() if not broken]
     assert len({mutant.right for mutant in MUTANTS}) >= 8

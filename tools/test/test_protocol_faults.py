@@ -127,7 +127,7 @@ def test_the_ledger_sees_broken_rules() -> None:
 
     assert judged({0: {1: frame(1, 0)}, 1: {2: frame(2, 1)}}).broken == []
     assert "agent 3 sends in a turn of 2" in judged({1: {3: frame(3, 1)}}).broken[0]
-    assert "gives turns away in somebody else's turn" in judged({1: {3: frame(3, 1, b"\1" + bytes(10))}}).broken[1]
+    assert "gives turns away in another agent's turn" in judged({1: {3: frame(3, 1, b"\1" + bytes(10))}}).broken[1]
     given = {4: {1: frame(1, 4, b"\3" + bytes(10))}}
     assert judged({**given, 8: {3: frame(3, 8)}}).broken == []
     assert "owner 1 sends in a turn that it gave" in judged({**given, 8: {1: frame(1, 8)}}).broken[0]

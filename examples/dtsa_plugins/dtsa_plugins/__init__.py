@@ -1,4 +1,4 @@
-"""One of each: who sends next, where the others are, where to fly. See docs/reference/plug-ins.md.
+"""A policy, an estimator and an avoider. See docs/reference/plug-ins.md.
 
 Everything here is a pure function of what the observer knows: no clock, no global random numbers. That is
 what makes nodes and simulator agree, and flights repeatable.
@@ -21,10 +21,10 @@ class LeastKnown:
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         self.agents = config.agents
-        self.every = 10  # each tenth slot is TDMA's, so that nobody is forgotten
+        self.every = 10  # each tenth slot is TDMA's, so that no agent is forgotten
 
     def choose(self, table: Table, slot: int) -> int:
-        """Id of the sender of a slot, 0: nobody."""
+        """Return the id of the agent expected to send in a slot, 0: none."""
         if slot < self.agents or slot % self.every == 0 or not table.in_ap.any():
             return slot // (1 if slot < self.agents else self.every) % self.agents + 1
         speed = np.sqrt((table.sent_velocity**2).sum(axis=0)) + 0.1

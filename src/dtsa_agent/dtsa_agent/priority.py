@@ -1,9 +1,8 @@
-"""Priority of processes and threads: what flies vehicles, or is the air of all others, goes before everything ordinary.
+"""Priority of processes and threads: bridge, agents and simulated channel run before ordinary processes.
 
-A Crazyflie levels out when it has heard nothing for half a second, and its emergency watchdog stops the motors after
-one second. On a busy station an ordinary process can be kept waiting for that long. The simulated channel is needed by
-all agents in every slot: it goes first, agents give way to it. A function that returns a text says why it failed; an
-empty text: it did not.
+A Crazyflie levels out half a second after the last packet, and its emergency watchdog stops motors after one second.
+On a busy computer an ordinary process may have to wait for that long. All agents need the simulated channel in every
+slot: it runs before the agents. Functions that return a text return why they failed, and an empty text on success.
 """
 
 from __future__ import annotations
@@ -22,23 +21,24 @@ _PR_SET_TIMERSLACK, _SLACK_NS = 29, 1_000
 
 @dataclass(frozen=True, slots=True)
 class PrioritySettings(Settings):
-    """Which processes go first on a computer."""
+    """Priority of a node's process."""
 
     priority: int = setting(
         0, "in real time: real-time priority of this process, where allowed; 0: none", minimum=0, maximum=90
     )
 
 
-def _for_all_threads(act: Callable[[int], None]) -> None:
+def _for_all_threads(apply: Callable[[int], None]) -> None:
     for task in Path("/proc/self/task").iterdir():
         with suppress(ProcessLookupError):  # a thread that has ended meanwhile
-            act(int(task.name))
+            apply(int(task.name))
 
 
 def set_realtime(level: int, inherited: bool = True) -> str:
-    """Run all threads of this process before everything ordinary (SCHED_RR), and what they start if ``inherited``.
+    """Run all threads of this process at real-time priority (SCHED_RR).
 
-    ``level``: 1 (low) to 99, 0: ordinary.
+    :param level: 1 (low) to 99; 0: ordinary.
+    :param inherited: whether processes and threads that they start have the same priority.
     """
     policy = os.SCHED_RR if level else os.SCHED_OTHER
     if level and not inherited:
@@ -52,9 +52,9 @@ def set_realtime(level: int, inherited: bool = True) -> str:
 
 @contextmanager
 def realtime_thread(level: int) -> Iterator[str]:
-    """Run this thread, not what it starts, before everything ordinary within the context; yields why not.
+    """Run this thread, but not its children, at real-time priority (SCHED_RR) within the context; yield why it failed.
 
-    ``level``: 1 (low) to 99; 0: as it is.
+    :param level: 1 (low) to 99; 0: unchanged.
     """
     before, problem = (os.sched_getscheduler(0), os.sched_getparam(0)), ""
     if level:
@@ -71,9 +71,9 @@ def realtime_thread(level: int) -> Iterator[str]:
 
 
 def set_nice(nice: int) -> str:
-    """Let all threads of this process, and those that they start, give way to others of the same session.
+    """Set the nice level of all threads of this process, and of those that they start.
 
-    ``nice``: 0 (ordinary) to 19 (gives way to all); down to -20 with the right to go first.
+    :param nice: 0 (ordinary) to 19 (last); below 0, down to -20, only with the privilege to raise priority.
     """
     try:
         _for_all_threads(lambda task: os.setpriority(os.PRIO_PROCESS, task, nice))
@@ -83,29 +83,29 @@ def set_nice(nice: int) -> str:
 
 
 def set_realtime_or_nice(priority: int, nice: int, inherited: bool = True) -> str:
-    """Set real-time priority where this process may have it, else a nice level."""
+    """Set real-time priority if this process is allowed to, else a nice level."""
     if priority and not set_realtime(priority, inherited):
         return ""
     return set_nice(nice) if nice else ""
 
 
 def set_ordinary_thread() -> None:
-    """Take real-time priority from this thread alone."""
+    """Return this thread to ordinary priority; the others keep theirs."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def use_last_processor() -> None:
     """Keep all threads of this process, and those that they start, on the last processor that it may use.
 
-    Only one thread of an interpreter runs at a time. Threads that wake on several processors at once wait for each
-    other there: a bridge of twelve Crazyflies takes half as much again. Only sensible with real-time priority.
+    Only one thread of a Python interpreter runs at a time, and threads on several processors wait for each other: a
+    bridge of twelve Crazyflies would need half as much time again. Only sensible with real-time priority.
     """
     last = max(os.sched_getaffinity(0))
     _for_all_threads(lambda task: os.sched_setaffinity(task, {last}))
 
 
 def avoid_last_processor() -> None:
-    """Keep all threads of this process, and what they start, off the processor that a bridge uses."""
+    """Keep all threads of this process, and those that they start, off the processor that a bridge uses."""
     allowed = os.sched_getaffinity(0)
     if len(allowed) > 1:
         _for_all_threads(lambda task: os.sched_setaffinity(task, allowed - {max(allowed)}))

@@ -80,8 +80,8 @@ class Stop:
         return in_time(self._patience_s)
 
     @contextmanager
-    def at_once(self) -> Iterator[None]:
-        """What is done within looks at no flag, and ends by an exception: imports, the making of nodes.
+    def interruptible(self) -> Iterator[None]:
+        """Let a signal raise an exception within the context: imports and the creation of nodes check no flag.
 
         :raises KeyboardInterrupt: on a signal, or if there was one before.
         """

@@ -14,7 +14,7 @@ from dtsa_agent.stop import Stop
 
 
 def _signalled(stop: Stop) -> None:
-    with stop.at_once():
+    with stop.interruptible():
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5)
 

@@ -48,7 +48,7 @@ def parallel_env(
     :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
     """
     if "policy" in settings:
-        raise ConfigError("policy", settings["policy"], "none: the actions say who sends")
+        raise ConfigError("policy", settings["policy"], "none: the actions decide which agents send")
     return SwarmEnv(config_of(config, settings), reward=reward, slots=slots, render_mode=render_mode)
 
 

@@ -135,8 +135,8 @@ def lost_frame() -> Drawing:
     config = SwarmConfig(agents=agents, moving=agents, policy="dtsa", scenario="waypoints", stops=4, seed=2)
     shown = play(config, first + count, (missed, by))[0][first:]
     drawing = Drawing("DTSA: what one lost frame does")
-    drawing.words("A row is an agent, a column a slot: whom that agent takes",
-                  "for the sender. All must agree, or two send, or nobody does.")  # fmt: skip
+    drawing.words("A row is an agent, a column a slot: the agent that it takes",
+                  "for the sender. All must agree, or two send, or none does.")  # fmt: skip
     left, top = 76.0, drawing.height + 34
     for column, slot in enumerate(shown):
         x = left + column * cell

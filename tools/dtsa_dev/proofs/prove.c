@@ -9,7 +9,7 @@
  *   who has something to say, and who knows that it will rest          (goals)
  *   whether a turn is given away, and to whom of those not thought dead
  *                                              (contents; choose_lessee is prove_lessee)
- *   whether a turn is handed on, and to whom           (contents; choose_next is prove_next)
+ *   whether a turn is handed on, and to whom           (contents; choose_next_lessee is prove_next)
  *   which turns are OPEN                               (contents; is_open is prove_open)
  *   whom a speaker thinks dead, and whether a hearer thought it dead
  *                                              (all that absence, silence and gossip can lead to)
@@ -66,7 +66,7 @@ int prove_lessee(const uint8_t *able, int count)
     return who[choose(found)];
 }
 
-/* In the place of choose_next. */
+/* In the place of choose_next_lessee. */
 int prove_next(const uint8_t *able, int self, int count);
 
 int prove_next(const uint8_t *able, int self, int count)

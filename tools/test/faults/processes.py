@@ -130,8 +130,8 @@ def agent_killed_and_started_again(flight: FlightProcess) -> None:
 
 
 _ends("all_agents_killed_in_real_time", "SIGKILL to all agents' processes, real time", REALTIME, signal.SIGKILL,
-      lambda flight: flight.nodes, "nobody is left",
-      reaction="the flight says that nobody is left and ends with code 1; the bag verifies")  # fmt: skip
+      lambda flight: flight.nodes, "no agent is left",
+      reaction="the flight says that no agent is left and ends with code 1; the bag verifies")  # fmt: skip
 
 
 @in_flight(

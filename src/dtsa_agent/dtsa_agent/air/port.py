@@ -142,8 +142,8 @@ class PortSettings(Protocol):
         """What agents, listeners and bags must know of it."""
 
     @property
-    def where(self) -> str:
-        """Where the frames go, for people."""
+    def destination(self) -> str:
+        """Destination of the frames, for logs."""
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain values."""

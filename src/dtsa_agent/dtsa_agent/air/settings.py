@@ -69,8 +69,8 @@ class UdpSettings(Settings):
         return PortProperties("udp", self.flight_time_ns, self.byte_time_ns)
 
     @property
-    def where(self) -> str:
-        """Where the frames go, for people."""
+    def destination(self) -> str:
+        """Destination of the frames, for logs."""
         return f"{self.group} on {self.interface}"
 
     @property
@@ -147,8 +147,8 @@ class CrazyradioSettings(Settings):
         )  # fmt: skip
 
     @property
-    def where(self) -> str:
-        """Where the frames go, for people."""
+    def destination(self) -> str:
+        """Destination of the frames, for logs."""
         return f"{self.uri}, P2P port {self.p2p_port}"
 
 
@@ -210,6 +210,6 @@ class SerialSettings(Settings):
         )  # fmt: skip
 
     @property
-    def where(self) -> str:
-        """Where the frames go, for people."""
+    def destination(self) -> str:
+        """Destination of the frames, for logs."""
         return f"{self.device} at {self.baud} baud, modem {self.modem}"

@@ -1,6 +1,6 @@
-"""Quadcopters without I/O: slots and frames in, frames and commands out. The caller owns clock, radio and motors.
+"""Agents without I/O: slots and frames in, frames and commands out. The caller owns clock, radio and motors.
 
-:class:`AgentGroup` is what the nodes run, with all agents of a process; :class:`Agent` is the same for a single one.
+:class:`AgentGroup` holds all agents of a process, as nodes run them; :class:`Agent` is a single one.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from dtsa_agent.core.settings.scenario import Scenario
 from dtsa_agent.core.station import check_slotted
 from dtsa_agent.core.swarm import Bytes, SlotOutcome, Swarm
 
-REFUSED = "reception refused"  # a frame that reached an agent and was not taken in; what processes call it
+REFUSED = "reception refused"  # name of the count of frames that reached an agent and were not accepted
 
 
 class AgentGroup:
     """The agents of one process. In every slot call ``on_slot``, ``on_frames``, ``on_slot_end``, in this order.
 
-    :param swarm: the agents; a shared table is given up with the first frame that not all of them have heard.
+    :param swarm: the agents; they stop sharing a table at the first frame that not all of them receive.
     :raises ConfigError: for a policy without slots.
     """
 
     def __init__(self, swarm: Swarm) -> None:
         check_slotted(swarm.config.policy)
         self.swarm = swarm
-        self.refused = 0  # frames that reached an agent and were not taken in, over all agents
+        self.refused = 0  # frames that reached an agent and were not accepted, summed over agents
         self.slot = -1  # the present slot, -1: none
 
     def on_slot(self, slot: int) -> tuple[int, ...]:
-        """Decide for a slot that begins now; the slot before is closed.
+        """Begin a slot, and decide which local agents send in it; the slot before must be closed.
 
         :returns: positions in ``swarm.ids`` of those that send; their frames are ``swarm.frame(position)``.
         """
@@ -46,20 +46,20 @@ class AgentGroup:
         return swarm.begin(slot)
 
     def on_frames(self, slot: int, senders: Sequence[int], frames: Sequence[bytes], heard: Bytes) -> Bytes | None:
-        """Receive all that the air carried in a slot.
+        """Receive the frames of a slot.
 
-        :param slot: the slot in which it is heard.
-        :param senders: ids of those that sent, as the air knows them.
-        :param frames: their frames; malformed and foreign ones are counted and change nothing.
-        :param heard: (F, N) 1: who of all agents received each frame.
-        :returns: (F, L) who of the local agents took each in; None if they share a table, or there are no frames.
+        :param slot: the slot in which they arrive.
+        :param senders: ids of the agents that sent, as the channel knows them.
+        :param frames: their F frames; malformed and foreign ones are counted and change nothing.
+        :param heard: (F, N) 1 where an agent (of all N) received a frame.
+        :returns: (F, L) 1 where one of the L local agents accepted a frame; None if they share a table, or if F = 0.
         """
         swarm = self.swarm
         if swarm.shared:
             own = [swarm.ids[index] for index in np.flatnonzero(swarm.sends)]
             received = heard.copy()
-            received[np.arange(len(senders)), np.array(senders, dtype=np.intp) - 1] = 1  # knows what it said
-            # A frame that nobody heard is known to its sender alone.
+            received[np.arange(len(senders)), np.array(senders, dtype=np.intp) - 1] = 1  # a sender knows its own frame
+            # A frame without receivers is known to its sender alone: the tables are no longer equal.
             if all(agent in senders for agent in own) and received[:, swarm.local].all():
                 for frame in frames:
                     self.refused += 0 if swarm.hear(slot, frame) else len(swarm.ids) - 1
@@ -75,9 +75,9 @@ class AgentGroup:
         return local
 
     def on_slot_end(self, collided: Bytes | None = None) -> None:
-        """The present slot is over.
+        """Close the present slot.
 
-        :param collided: (V,) which receivers noticed a collision; None: they cannot tell it from silence.
+        :param collided: (V,) 1 where an observer detected a collision; None: receivers cannot tell it from silence.
         """
         self.swarm.end(self.slot, collided)
         self.slot = -1
@@ -85,20 +85,20 @@ class AgentGroup:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What an agent decided for one slot, and why."""
+    """Decision of an agent for one slot."""
 
     slot: int
-    chosen: int  # id taken for the slot's sender, 0: nobody
+    chosen: int  # id of the agent that it expects to send, 0: none
     reason: str  # one of REASONS
-    score: float  # priority value g of the chosen
-    digest: int  # of the agent's table: equal digests, equal tables
+    score: float  # priority value g of that agent
+    digest: int  # of the deciding agent's table: equal digests, equal tables
 
 
 class Agent:
     """One agent: scheduler, estimator and avoider. Time is the slot number.
 
-    In every slot call :meth:`on_slot`, then :meth:`on_frame` for what was heard in it, :meth:`command` as often as
-    wanted, and :meth:`on_slot_end`.
+    In every slot call :meth:`on_slot`, then :meth:`on_frame` for each frame received in it, :meth:`command` at each
+    control instant, and :meth:`on_slot_end`.
 
     :param id: this agent's id, 1 .. N.
     :param config: the settings that all agents share.
@@ -118,41 +118,39 @@ class Agent:
         self.group = AgentGroup(self.swarm)
 
     def on_slot(self, slot: int) -> bytes | None:
-        """Decide for a slot that begins now.
+        """Begin a slot, and decide whether to send in it.
 
-        :param slot: its number; if the slot before is still open it is closed.
-        :returns: the frame to send in it, or None.
+        :param slot: its number; the slot before is closed if it is still open.
+        :returns: the frame to send, or None.
         """
         if self.group.slot >= 0:
             self.on_slot_end()
         return self.swarm.frame(0) if self.group.on_slot(slot) else None
 
     def on_frame(self, data: bytes, slot: int) -> bool:
-        """Receive the bytes of a frame.
+        """Receive a frame.
 
-        :param data: what was heard; malformed bytes are counted in ``swarm.malformed`` and ignored.
-        :param slot: the slot it was heard in.
-        :returns: whether it was a frame of this swarm and this time.
+        :param data: its bytes; malformed ones are counted in ``swarm.malformed`` and ignored.
+        :param slot: the slot in which it arrived.
+        :returns: whether it was accepted: a frame of this swarm and this slot time.
         """
         return self.swarm.hear(slot, data)
 
     def on_slot_end(self, outcome: SlotOutcome | None = None) -> None:
-        """The slot is over.
+        """Close the slot.
 
-        :param outcome: what the receiver could tell; None: a frame if one was heard, else silence.
+        :param outcome: as the receiver detected it; None: a frame if one arrived, else silence.
         """
         collided = None if outcome is None else np.array([outcome == SlotOutcome.COLLISION], dtype=np.uint8)
         self.group.on_slot_end(collided)
 
     def decision(self) -> Decision:
-        """The decision for the present slot."""
-        s = self.swarm
-        return Decision(
-            max(0, self.group.slot), int(s.chosen[0]), s.reason_name(0), float(s.score[0]), int(s.digest[0])
-        )
+        """Return the decision for the present slot."""
+        swarm, slot = self.swarm, max(0, self.group.slot)
+        return Decision(slot, int(swarm.chosen[0]), swarm.reason_name(0), float(swarm.score[0]), int(swarm.digest[0]))
 
     def command(self, position: Vector, velocity: Vector, slot: int, step: int = 0) -> Vector:
-        """Where to fly.
+        """Return the velocity to fly with.
 
         :param position: own true position, m, frame map.
         :param velocity: own true velocity, m/s.

@@ -1,47 +1,48 @@
-"""Errors that say whose fault it was."""
+"""Errors by their source: settings of the user, bugs of this software, plug-ins, frames of other agents."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
 
-UNKNOWN = "one of the settings "  # what is allowed begins with it where no setting has the name of the field
-_LONGEST = 120  # characters of a value that an error repeats
+SETTING_NAMES = "one of the settings "  # begins the allowed values of an error about an unknown setting
+_MAX_SHOWN = 120  # characters of a value in an error's text
 
 
 class DtsaError(Exception):
-    """Base of all errors that this project raises on purpose."""
+    """Base class of this project's errors."""
 
 
 def shown(value: object) -> str:
-    """A value as errors repeat it: not too long, whatever its own ``__repr__`` does."""
+    """Return a value's ``repr``, shortened, for an error's text; never raises."""
     try:
         text = repr(value)
     except Exception:
         text = f"<{type(value).__name__}>"
-    return text if len(text) <= _LONGEST else text[:_LONGEST] + " ..."
+    return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + " ..."
 
 
 def did_you_mean(word: str, words: Iterable[str]) -> str:
-    """A question that names the nearest of the words that would have been right; empty if none is near."""
-    import difflib  # an agent in flight needs none
+    """Return a question that names the most similar of the allowed words; empty if none is similar."""
+    import difflib  # not loaded in flight
 
     near = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
     return f"; did you mean {near[0]}?" if near and near[0] != word else ""
 
 
 class ConfigError(DtsaError, ValueError):
-    """A setting, as the user wrote it, is not usable.
+    """A setting has a value that is not allowed.
 
-    ``allowed`` says in words what would have been; where it lists names, the nearest one is asked for.
+    :param field: full name of the setting.
+    :param allowed: the allowed values, in words; if it lists names, the error suggests the most similar one.
     """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
-        given = value[:_LONGEST] if isinstance(value, str) else ""
-        wrong = field.rpartition(".")[2] if allowed.startswith(UNKNOWN) else given
-        listed = re.split(r"\s*[,;]\s*|\s+or\s+", allowed.removeprefix(UNKNOWN))
-        near = did_you_mean(wrong, [word for word in listed if re.fullmatch(r"[A-Za-z][\w.-]*", word)])
-        super().__init__(f"{field}: got {shown(value)}; allowed: {allowed}{near}")
+        text = value[:_MAX_SHOWN] if isinstance(value, str) else ""
+        wrong_word = field.rpartition(".")[2] if allowed.startswith(SETTING_NAMES) else text
+        words = re.split(r"\s*[,;]\s*|\s+or\s+", allowed.removeprefix(SETTING_NAMES))
+        question = did_you_mean(wrong_word, [word for word in words if re.fullmatch(r"[A-Za-z][\w.-]*", word)])
+        super().__init__(f"{field}: got {shown(value)}; allowed: {allowed}{question}")
         self.field, self.value, self.allowed = field, value, allowed
 
     def __reduce__(self) -> tuple[type[ConfigError], tuple[str, object, str]]:
@@ -49,29 +50,32 @@ class ConfigError(DtsaError, ValueError):
 
 
 def range_text(low: float | None, high: float | None, unit: str = "") -> str:
-    """A range in words, as ``allowed`` of an error says it; one of the bounds may be None."""
+    """Return a range in words, for ``allowed`` of an error; one of the bounds may be None."""
     first, last = (f"{bound:g}" if isinstance(bound, float) else str(bound) for bound in (low, high))
-    tail = f" {unit}" if unit not in ("", "1") else ""
+    unit_text = f" {unit}" if unit not in ("", "1") else ""
     if high is None:
-        return f"{first} or more{tail}"
+        return f"{first} or more{unit_text}"
     if low is None:
-        return f"{last} or less{tail}"
-    return f"{first} to {last}{tail}"
+        return f"{last} or less{unit_text}"
+    return f"{first} to {last}{unit_text}"
 
 
 class LocalProtocolError(DtsaError):
-    """We broke the protocol ourselves: a bug on this side."""
+    """This software broke the protocol: a bug."""
 
 
 class PluginError(DtsaError):
-    """A part from another package (kind, name and method) raised an error, or gave what it may not give."""
+    """A plug-in raised an error, or returned a value that is not allowed.
+
+    :param part: kind, name and method of the plug-in.
+    """
 
     def __init__(self, part: str, fault: str) -> None:
         super().__init__(f"{part}: {fault}")
 
     @classmethod
-    def raised(cls, part: str, error: BaseException) -> PluginError:
-        """An error that the part raised, with the place in it."""
+    def from_exception(cls, part: str, error: BaseException) -> PluginError:
+        """Wrap an exception that a plug-in raised; names file and line."""
         trace = error.__traceback__
         while trace is not None and trace.tb_next is not None:
             trace = trace.tb_next
@@ -84,4 +88,4 @@ class PluginError(DtsaError):
 
 
 class RemoteProtocolError(DtsaError):
-    """A frame from outside is not usable: never stops a node, it is counted."""
+    """A frame from outside is not usable. Nodes count it and go on."""

@@ -22,10 +22,10 @@ PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/refe
 MAX_OWN_BYTES = 16  # of one plug-in
 SELECTIONS, PROFILES, REASONS = NAMES["selections"], NAMES["profiles"], NAMES["reasons"]
 
-# Why an agent takes whom it takes for the sender of a slot, and what that means.
+# Why an agent expects another one (or none) to send in a slot, and what that means.
 REASON_TEXTS: Mapping[str, str] = MappingProxyType(
     {
-        "nobody": "nobody moves any more, so nobody has a claim to the slot",
+        "nobody": "no agent moves any more, so no agent has a claim to the slot",
         "tdma": "the slot's number says whose turn it is: slot modulo N",
         "boot": "first round: every agent sends once, in the order of ids, so that all know all",
         "age-cap": "was silent for longer than the age cap allows, whatever its priority",
@@ -36,11 +36,11 @@ REASON_TEXTS: Mapping[str, str] = MappingProxyType(
         "random": "a draw decides whether the agent sends",
         "plugin": "a policy from another package decided",
         "own": "the owner uses its own turn",
-        "anchor": "the owner's turn that nobody else gives away, so that all hear of it now and then",
+        "anchor": "the owner's turn that no other agent gives away, so that all hear of the owner now and then",
         "leased": "the owner gave this turn to an agent that has more to say",
-        "adopted": "the owner is thought dead; the next one alive gave its turn away",
-        "open": "turn for whoever has just woken or joined; nobody in particular is expected",
-        "absent": "the owner is thought dead, and nobody was given its turn",
+        "adopted": "the owner is absent; the next agent that is not gave its turn away",
+        "open": "turn for any agent that has just started moving or joined; no particular agent is expected",
+        "absent": "the owner is absent, and its turn was given to no agent",
         "probation": "the owner is new or was away, and may send at its anchors only",
         "innovation": "of those that move the longest silent, weighed by how much its velocity has just changed",
     }

@@ -135,7 +135,7 @@ class RadioUser:
 class RadioLoad:
     """What one radio, or one channel of several radios, has to carry."""
 
-    where: str
+    medium: str  # radio, or channel of several radios
     robots: tuple[str, ...]
     exchanges: float  # wanted, per second
     seconds: float  # that they take, per second
@@ -153,7 +153,7 @@ class RadioLoad:
 
     def __str__(self) -> str:
         load = f"{len(self.robots)} Crazyflies, {self.exchanges:.0f} of {self.capacity:.0f} exchanges/s"
-        return f"{self.where}: {load}: {'fits' if self.fits else f'DOES NOT FIT ({self.advice})'}"
+        return f"{self.medium}: {load}: {'fits' if self.fits else f'DOES NOT FIT ({self.advice})'}"
 
     @property
     def advice(self) -> str:
@@ -183,7 +183,7 @@ def radio_loads(users: Iterable[RadioUser]) -> list[RadioLoad]:
             anywhere = f" on channel {user.address.channel}" if user.address.radio == ANY else ""
             dongles.setdefault(f"radio {user.address.radio}{anywhere}", []).append(user)
             channels.setdefault(user.address.channel, []).append(user)
-    loads = [_load(where, dongles[where]) for where in sorted(dongles)]
+    loads = [_load(medium, dongles[medium]) for medium in sorted(dongles)]
     for channel, sharing in sorted(channels.items()):
         radios = sorted({user.address.radio for user in sharing})
         if len(radios) > 1:
@@ -191,11 +191,11 @@ def radio_loads(users: Iterable[RadioUser]) -> list[RadioLoad]:
     return loads
 
 
-def _load(where: str, users: list[RadioUser]) -> RadioLoad:
+def _load(medium: str, users: list[RadioUser]) -> RadioLoad:
     times = [EXCHANGES * exchange_s(user.address.rate, shared=len(users) > 1) for user in users]
     rates = [max(user.command_hz, user.log_hz) + WATCHDOG_HZ + ORDERS_HZ for user in users]
     return RadioLoad(
-        where, tuple(user.name for user in users), EXCHANGES * sum(rates),
+        medium, tuple(user.name for user in users), EXCHANGES * sum(rates),
         sum(time * rate for time, rate in zip(times, rates, strict=True)), 1.0 / sum(times) - WATCHDOG_HZ - ORDERS_HZ,
     )  # fmt: skip
 
@@ -210,7 +210,7 @@ def check_budget(loads: Sequence[RadioLoad], *, force: bool) -> None:
         if not load.fits and not force:
             most = int(len(load.robots) / load.seconds)
             raise ConfigError(
-                load.where,
+                load.medium,
                 f"{len(load.robots)} Crazyflies with {load.exchanges:.0f} exchanges/s",
                 f"{load.capacity:.0f} exchanges/s, {most} Crazyflies at these rates: {load.advice}, use more radios "
                 "on channels of their own or a higher data rate, or set force_budget",

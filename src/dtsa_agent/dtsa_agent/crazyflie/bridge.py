@@ -75,7 +75,7 @@ class Bridge:
     ) -> None:
         self.settings = settings
         station = settings.station
-        for line in settings.summary():
+        for line in settings.describe():
             log("info", line)
         check_budget(settings.loads, force=station.force_budget)
         require_cflib()

@@ -375,7 +375,7 @@ class DongleThread(threading.Thread):
             self.foreign = share > FOREIGN_SHARE
             if self.foreign and not before:
                 text = f"{share:.0%} of the packets on channel {link.address.channel} are repeated"
-                self._report("warn", f"radio {self.radio}: {text}: does somebody else send there?")
+                self._report("warn", f"radio {self.radio}: {text}: does another transmitter use its channel?")
 
     def _send_stops(self, channel: int, rate: int) -> None:
         self._device.set_channel(channel)

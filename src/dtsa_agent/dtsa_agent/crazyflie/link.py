@@ -72,7 +72,7 @@ class LogClock:
     tell, as the smallest delay that was ever seen is that of a packet without a wait. Times (`now`) are s, monotonic.
     """
 
-    DRIFT = 1e-4  # of the Crazyflie's clock against ours, at most
+    MAX_DRIFT = 1e-4  # of the Crazyflie's clock against ours, at most
     RESTARTED_S = 5.0  # a stamp that is so far off is that of a Crazyflie that was switched on again
 
     def __init__(self) -> None:
@@ -85,7 +85,7 @@ class LogClock:
         if self._offset is None or abs(offset - self._offset) > self.RESTARTED_S:
             self._offset = offset
         else:
-            self._offset = min(offset, self._offset + self.DRIFT * (now - self.last))
+            self._offset = min(offset, self._offset + self.MAX_DRIFT * (now - self.last))
         self.last = now
         return min(now, stamp_ms / 1000 + self._offset)
 
@@ -305,7 +305,7 @@ class CrazyflieLink:
         def sample(stamp: int, values: dict[str, float], block: Any) -> None:
             x, y, z = (values[name] for name in PLACE)
             vx, vy, vz = (values[name] for name in VARIANCES)
-            if self._settling.sample((x, y, z), (vx, vy, vz), self._measured_place()):
+            if self._settling.add_sample((x, y, z), (vx, vy, vz), self._measured_place()):
                 settled.set()
 
         if (place := self._measured_place()) is not None:  # the filter begins where it is seen, not metres away

@@ -1,6 +1,6 @@
-"""The protocol on board of Crazyflies: its settings, and what the ground sends to each app before it starts.
+"""The protocol on board of Crazyflies: its settings, and the set-up that the ground sends to each app before the start.
 
-The app is in `dtsa_agent/onboard`; what its parameters and orders mean stands in docs/how-to/on-board.md.
+The app is in `dtsa_agent/onboard`; docs/how-to/on-board.md explains its parameters and orders.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ MAX_AGENTS = 20  # AGENTS_MAX of app.c
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")  # numbers of libdtsa
 ESTIMATORS = ("hold", "linear")
 KEY_BYTES = 16
-FLIGHT_US = 1500
-ENABLE = "dtsa.enable"
-START = b"S"
-#: Named as that of a computer with a Crazyradio: they are on one air, and datagrams begin alike.
+FLIGHT_US = 1500  # of a frame, from the app that sends it to the apps that receive it
+ENABLE = "dtsa.enable"  # parameter of the app: whether its agent steers
+START = b"S"  # order that starts the agent
+#: Has the name of a computer's Crazyradio port: both share one channel and one datagram header.
 PORT = PortProperties("crazyradio", FLIGHT_US * 1000, 0, agreed_bytes=2, peers=0, longest=60, bare_sealed=True)
-_MARGIN_M = 0.8  # of the box around all places
-_ANSWER_S = 0.5  # longest wait for the answer to an order
-_TIMES = 4  # that an order is sent
-_SET_S = 5.0  # longest wait until all parameters are confirmed
+_MARGIN_M = 0.8  # of the box around all starts and goals
+_ANSWER_TIMEOUT_S = 0.5  # for the answer to an order
+_ATTEMPTS = 4  # to send an order
+_CONFIRM_TIMEOUT_S = 5.0  # until all parameters are confirmed
 
 
 @dataclass(frozen=True, slots=True)
 class OnboardSettings(Settings):
-    """Crazyflies that steer themselves."""
+    """Crazyflies whose agents run on board."""
 
     swarm: Mapping[str, Any] = setting(
-        {}, "settings of the swarm, as for `dtsa simulate`, without `agents`; empty: none steers itself",
+        {}, "settings of the swarm, as for `dtsa simulate`, without `agents`; empty: no Crazyflie steers itself",
         kind="structure",
     )  # fmt: skip
     polls_hz: float = setting(
@@ -58,13 +58,13 @@ class OnboardSettings(Settings):
             raise ConfigError("swarm.agents", self.swarm["agents"], "nothing: the robots of the file are the agents")
 
     @property
-    def on(self) -> bool:
-        """Whether the Crazyflies steer themselves."""
+    def enabled(self) -> bool:
+        """Whether agents on board steer the Crazyflies."""
         return bool(self.swarm)
 
 
 def check_onboard_swarm(swarm: SwarmConfig) -> None:
-    """Refuse a swarm that the app cannot fly; ConfigError: it cannot."""
+    """Check that the app can fly a swarm; ConfigError: it cannot."""
     if swarm.agents > MAX_AGENTS:
         raise ConfigError("agents", swarm.agents, f"1 to {MAX_AGENTS} on board")
     if swarm.policy not in POLICIES:
@@ -75,16 +75,16 @@ def check_onboard_swarm(swarm: SwarmConfig) -> None:
 
 
 def app_parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[str, float]:
-    """Return the app's parameters of a swarm, by their full names; it may not steer yet.
+    """Return the app's parameters for a swarm, by `group.name`; the agent is not enabled yet.
 
-    :param scenario: starts and goals; the app lands outside of the box around them.
+    :param scenario: starts and goals; outside the box around them the app lands.
     :param height: m, of the frame map's origin above the floor.
     """
     values: dict[str, float] = {
         "enable": 0, "agents": swarm.agents, "policy": POLICIES.index(swarm.policy),
         "estimator": ESTIMATORS.index(swarm.estimator),
         "header": int.from_bytes(header_of(swarm, PORT) or b"\0\0", "little"), "steps": swarm.steps,
-        # In this slot all begin together with a policy that no agent can join.
+        # With a policy that no agent can join later, all agents begin together in this slot.
         "beginSlot": 0 if swarm.policy_row.may_join else 4 * swarm.turn_every * swarm.agents,
         "goalsKnown": swarm.targets_known,
         "slotUs": swarm.slot_ns // 1000, "flightUs": FLIGHT_US, "seed": swarm.seed, "height": height,
@@ -110,7 +110,10 @@ def key_of(swarm: SwarmConfig) -> bytes:
 
 
 def app_orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[bytes]:
-    """Return the packets of the app channel before the start: draw of lots, places of all agents, key (16 bytes)."""
+    """Return the orders that set up the app: random key of the policy, starts and goals of all agents, signing key.
+
+    :param key: 16 bytes, if frames are signed.
+    """
     packets = [b"D" + struct.pack("<Q", policy_key(swarm.seed))]
     for letter, places in ((b"F", scenario.start), (b"T", scenario.target)):
         for k in range(swarm.agents):
@@ -121,8 +124,10 @@ def app_orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list
 
 
 class OnboardSetup:
-    """What one Crazyflie's app gets on the ground: parameters by `group.name`, and packets of the app channel.
+    """Set-up of one Crazyflie's app on the ground.
 
+    :param parameters: of the app, by `group.name`.
+    :param orders: packets of the app channel, sent in this order.
     :param polls_hz: Hz, how often the Crazyflie is polled once its agent has started.
     """
 
@@ -131,30 +136,30 @@ class OnboardSetup:
         self.polls_hz = polls_hz
 
     def prepare(self, cf: Any) -> None:
-        """Send all that the app needs before its agent starts; LinkError: it has no such app, or the app refuses."""
-        missing, confirmed = set(self._parameters), threading.Event()
+        """Send parameters and orders to the app; LinkError: the Crazyflie has no such app, or the app refuses."""
+        unconfirmed, all_confirmed = set(self._parameters), threading.Event()
 
-        def note(name: str, value: str) -> None:
-            missing.discard(name)
-            if not missing:
-                confirmed.set()
+        def confirm(name: str, value: str) -> None:
+            unconfirmed.discard(name)
+            if not unconfirmed:
+                all_confirmed.set()
 
         for name, value in self._parameters.items():
-            cf.param.add_update_callback(*name.split("."), cb=note)
+            cf.param.add_update_callback(*name.split("."), cb=confirm)
             try:
                 cf.param.set_value(name, value)
             except (KeyError, AttributeError) as error:
                 raise LinkError(f"parameter {name} of the app on board: {error}") from error
-        if not confirmed.wait(_SET_S):
-            raise LinkError(f"not confirmed: {', '.join(sorted(missing))}")
+        if not all_confirmed.wait(_CONFIRM_TIMEOUT_S):
+            raise LinkError(f"not confirmed: {', '.join(sorted(unconfirmed))}")
         for name in self._parameters:
-            cf.param.remove_update_callback(*name.split("."), cb=note)
+            cf.param.remove_update_callback(*name.split("."), cb=confirm)
         for order in self._orders:
             send_order(cf, order)
 
 
 def send_order(cf: Any, order: bytes) -> None:
-    """Send an order to the app on board, and wait for its answer; LinkError: there is none, or it refuses."""
+    """Send an order to the app on board, and wait for its answer; LinkError: no answer, or the app refuses."""
     answers: list[bytes] = []
     answered = threading.Event()
 
@@ -165,9 +170,9 @@ def send_order(cf: Any, order: bytes) -> None:
 
     cf.appchannel.packet_received.add_callback(receive)
     try:
-        for _ in range(_TIMES):
+        for _ in range(_ATTEMPTS):
             cf.appchannel.send_packet(order)
-            if answered.wait(_ANSWER_S):
+            if answered.wait(_ANSWER_TIMEOUT_S):
                 break
     finally:
         cf.appchannel.packet_received.remove_callback(receive)

@@ -1,6 +1,6 @@
-"""Where motion capture sees one Crazyflie: what may be believed of it, and whether the Crazyflie knows it, too. Pure.
+"""Poses of one Crazyflie from motion capture: plausibility checks, and agreement with the onboard estimate. No I/O.
 
-Poses, stamps and clocks come in as arguments. A pose that is not believed is counted by its reason and never sent.
+Poses, stamps and clocks come in as arguments. A refused pose is counted by its cause and never sent.
 Times (`now`) are s, monotonic; stamps are s, Unix time, 0: not known.
 """
 
@@ -16,15 +16,15 @@ from .state import Quaternion, Vector, outside_by, place_text, to_map, to_world
 
 NONE, POSE, NAMED_POSES = "none", "pose", "named_poses"
 EXTPOS, EXTPOSE = "extpos", "extpose"
-FASTEST_MPS = 3.0  # no vehicle is carried or flies faster from one pose to the next
+MAX_SPEED_MPS = 3.0  # of a vehicle, carried or flying, between two poses
 NORM_TOLERANCE = 0.05  # of a quaternion's length
-TURN_RAD, FASTEST_RADPS = 0.5, 15.0  # no vehicle turns further at once, and faster
-TILT_RAD = 1.2  # no vehicle flies so far from level
-DRIFT = 1e-3  # s/s, by which two clocks may drift apart
-MOVED_AGAIN = 20  # poses in a row that agree with each other: on the ground it was carried, or a clock was set
-FRESH_S = 0.3  # a pose that is not older is where the vehicle is
-ROOM_MARGIN_M = 0.3  # outside the geofence a pose or an estimate may be this far and still be meant
-SAMPLES, STEADY_M = 5, 0.05  # of a settled estimator: its place moves less than that over so many samples
+MAX_TURN_RAD, MAX_TURN_RADPS = 0.5, 15.0  # between two poses: a fixed part, and one that grows with time
+MAX_TILT_RAD = 1.2  # from level, in flight
+MAX_DRIFT = 1e-3  # s/s, of two clocks against each other
+POSES_AFTER_JUMP = 20  # that agree: then the vehicle was carried on the ground, or a clock was set
+FRESH_POSE_S = 0.3  # an older pose no longer tells where the vehicle is
+ROOM_MARGIN_M = 0.3  # by which a pose or an estimate may lie outside the geofence
+SETTLED_SAMPLES, SETTLED_SPREAD_M = 5, 0.05  # a settled estimate moves less than this over so many samples
 
 Room = tuple[Vector, Vector]  # lower and upper corner, m, frame map
 
@@ -50,7 +50,7 @@ class PositionSettings(Settings):
         0.1, "largest distance from the estimate to motion capture with which a vehicle is ready, armed, and takes off",
         unit="m", minimum=0.005, maximum=1,
     )  # fmt: skip
-    jump_m: float = setting(0.3, f"a pose farther than this, and {FASTEST_MPS:g} m/s, from the one before is refused",
+    jump_m: float = setting(0.3, f"a pose farther than this, and {MAX_SPEED_MPS:g} m/s, from the one before is refused",
         unit="m", minimum=0.01, maximum=10)  # fmt: skip
     late_s: float = setting(
         0.06, "a pose that takes so much longer than the fastest one is refused: the vehicle has moved on",
@@ -58,39 +58,42 @@ class PositionSettings(Settings):
     )  # fmt: skip
 
     @property
-    def on(self) -> bool:
+    def enabled(self) -> bool:
         """Whether there is motion capture."""
         return self.source != NONE
 
     def topic_of(self, name: str) -> str:
-        """Topic on which the poses of a Crazyflie come."""
+        """Return the topic of a Crazyflie's poses."""
         return (self.topic or ("/{name}/pose" if self.source == POSE else "/poses")).replace("{name}", name)
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPose:
-    """A pose of motion capture that is believed."""
+    """A pose of motion capture that passed the checks."""
 
     position: Vector  # m, world
     orientation: Quaternion | None  # None: not known
     stamp: float
-    time: float  # of its arrival
+    time: float  # arrival, s, monotonic
 
 
 class RefusedPose(Exception):
-    """A pose is not believed: the kind, and why."""
+    """A pose fails a check.
 
-    def __init__(self, kind: str, reason: str) -> None:
+    :param cause: one or two words, by which refusals are counted.
+    """
+
+    def __init__(self, cause: str, reason: str) -> None:
         super().__init__(reason)
-        self.kind = kind
+        self.cause = cause
 
 
 @dataclass(slots=True)
 class PoseTracker:
-    """Poses of one Crazyflie.
+    """Checks the poses of one Crazyflie, and keeps the last accepted one.
 
-    :param origin: m, where the Crazyflies' world sees the origin of `map`.
-    :param room: corners of the box (m, map) outside of which no pose is believed, but for a margin; None: no limits.
+    :param origin: m, of frame `map` in the Crazyflies' world.
+    :param room: corners of a box (m, map); poses more than ROOM_MARGIN_M outside are refused; None: no limits.
     """
 
     settings: PositionSettings
@@ -98,45 +101,46 @@ class PoseTracker:
     room: Room | None
     last: MeasuredPose | None = None
     refused: Counter[str] = field(default_factory=Counter)
-    reason: str = ""  # why the last one was refused; empty: it was not
-    sent: int = 0
+    reason: str = ""  # why the last pose was refused; empty: it was accepted
+    sent: int = 0  # poses sent to the Crazyflie
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=500))  # s, from the stamp to the packet
-    _times: deque[float] = field(default_factory=lambda: deque(maxlen=512))
-    _elsewhere: tuple[MeasuredPose, int] | None = None  # the last of poses that were refused but agree; their number
-    _least_lag: float = math.inf  # s, from the stamp to the arrival, of the fastest one; two clocks: of any size
+    _times: deque[float] = field(default_factory=lambda: deque(maxlen=512))  # arrivals of accepted poses
+    _after_jump: tuple[MeasuredPose, int] | None = None  # last of consecutive refused poses that agree; their number
+    _min_delay: float = math.inf  # s, from stamp to arrival, of the fastest pose; any size: there are two clocks
     _next_send: float = -math.inf
 
-    def offer(
+    def receive_pose(
         self, position: Vector, orientation: Quaternion, frame: str, stamp: float, now: float, *, flying: bool
     ) -> str:
-        """Check a pose (m, in `frame`: `world`, also empty, or `map`); why it is not believed, or an empty text.
+        """Check a pose (m, in `frame`: `world`, also empty, or `map`); return why it is refused, empty if it is not.
 
-        In flight nothing that has jumped is believed again, and nothing that repeats the pose before to the last bit.
+        In flight a pose that jumps is always refused, and so is an exact copy of the pose before.
         """
         try:
-            seen = self._plausible(position, orientation, frame, stamp, now, flying=flying)
+            pose = self._check_alone(position, orientation, frame, stamp, now, flying=flying)
             if self.last is not None:
                 try:
-                    self._check_follows(self.last, seen, flying=flying)
+                    self._check_follows(self.last, pose, flying=flying)
                 except RefusedPose:
-                    agrees = self._agrees_elsewhere(seen)
-                    if flying or not agrees:
+                    confirmed = self._confirm_jump(pose)
+                    if flying or not confirmed:
                         raise
-                    self._least_lag = math.inf  # perhaps the clock was set
+                    self._min_delay = math.inf  # perhaps the clock was set
         except RefusedPose as problem:
-            self.refused[problem.kind] += 1
+            self.refused[problem.cause] += 1
             self.reason = str(problem)
             return self.reason
         if stamp:
             waited = 0.0 if self.last is None else now - self.last.time
-            self._least_lag = min(self._least_lag + DRIFT * waited, now - stamp)
-        self.last, self.reason, self._elsewhere = seen, "", None
+            self._min_delay = min(self._min_delay + MAX_DRIFT * waited, now - stamp)
+        self.last, self.reason, self._after_jump = pose, "", None
         self._times.append(now)
         return ""
 
-    def _plausible(
+    def _check_alone(
         self, position: Vector, orientation: Quaternion, frame: str, stamp: float, now: float, *, flying: bool
     ) -> MeasuredPose:
+        """Check what a pose says by itself: frame, room, attitude; RefusedPose: it is impossible."""
         if frame not in ("", "world", "map"):
             raise RefusedPose("frame", f"frame_id {frame!r:.40} is neither world nor map")
         if not all(math.isfinite(v) for v in (*position, *orientation)):
@@ -151,83 +155,83 @@ class PoseTracker:
             raise RefusedPose("quaternion", f"the quaternion has length {norm:.3g}, not 1 (send: extpos needs none)")
         x, y, z, w = (c / norm for c in orientation)
         tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
-        if flying and tilt > TILT_RAD:
+        if flying and tilt > MAX_TILT_RAD:
             raise RefusedPose("attitude", f"it is tilted by {math.degrees(tilt):.0f} degrees in flight")
         return MeasuredPose(place, (x, y, z, w), stamp, now)
 
-    def _check_follows(self, last: MeasuredPose, seen: MeasuredPose, *, flying: bool) -> None:
-        """Whether a pose can follow the one before; RefusedPose: it cannot."""
-        passed = seen.time - last.time
-        if seen.stamp and last.stamp and seen.stamp <= last.stamp:
-            raise RefusedPose("stamp", f"its stamp is {last.stamp - seen.stamp:.3f} s before that of the last one")
-        late = seen.time - seen.stamp - self._least_lag
-        if seen.stamp and late > self.settings.late_s + DRIFT * passed:
+    def _check_follows(self, last: MeasuredPose, pose: MeasuredPose, *, flying: bool) -> None:
+        """Check a pose against the one before: order, delay, speed; RefusedPose: it cannot follow."""
+        passed = pose.time - last.time
+        if pose.stamp and last.stamp and pose.stamp <= last.stamp:
+            raise RefusedPose("stamp", f"its stamp is {last.stamp - pose.stamp:.3f} s before that of the last one")
+        late = pose.time - pose.stamp - self._min_delay
+        if pose.stamp and late > self.settings.late_s + MAX_DRIFT * passed:
             raise RefusedPose("late", f"it comes {late * 1000:.0f} ms later than the fastest one")
-        if flying and (seen.position, seen.orientation) == (last.position, last.orientation):
+        if flying and (pose.position, pose.orientation) == (last.position, last.orientation):
             raise RefusedPose("repeated", f"the same pose again, {passed:.2f} s later: motion capture stands still")
-        jump = math.dist(seen.position, last.position)
-        if jump > self.settings.jump_m + FASTEST_MPS * passed:
+        jump = math.dist(pose.position, last.position)
+        if jump > self.settings.jump_m + MAX_SPEED_MPS * passed:
             raise RefusedPose("jump", f"it jumps by {jump:.2f} m within {passed:.2f} s")
-        if seen.orientation is not None and last.orientation is not None:
-            same = abs(sum(a * b for a, b in zip(seen.orientation, last.orientation, strict=True)))
+        if pose.orientation is not None and last.orientation is not None:
+            same = abs(sum(a * b for a, b in zip(pose.orientation, last.orientation, strict=True)))
             turn = 2.0 * math.acos(min(1.0, same))
-            if turn > TURN_RAD + FASTEST_RADPS * passed:
+            if turn > MAX_TURN_RAD + MAX_TURN_RADPS * passed:
                 raise RefusedPose("attitude", f"it turns by {math.degrees(turn):.0f} degrees within {passed:.2f} s")
 
-    def _agrees_elsewhere(self, seen: MeasuredPose) -> bool:
-        """Whether enough poses agree on another place, or another time, than the last one that was believed."""
-        before, count = self._elsewhere or (seen, 0)
-        agrees = math.dist(before.position, seen.position) <= self.settings.jump_m
-        if count and (not agrees or (seen.stamp and seen.stamp <= before.stamp)):
+    def _confirm_jump(self, pose: MeasuredPose) -> bool:
+        """Whether enough consecutive poses agree on a place, or a time, that the last accepted pose does not have."""
+        before, count = self._after_jump or (pose, 0)
+        agrees = math.dist(before.position, pose.position) <= self.settings.jump_m
+        if count and (not agrees or (pose.stamp and pose.stamp <= before.stamp)):
             count = 0
-        self._elsewhere = seen, count + 1
-        return count + 1 >= MOVED_AGAIN
+        self._after_jump = pose, count + 1
+        return count + 1 >= POSES_AFTER_JUMP
 
-    def due(self, now: float) -> bool:
-        """Whether the last pose may be sent, at the rate that is allowed."""
+    def is_due(self, now: float) -> bool:
+        """Whether the last pose may be sent now, at `max_rate_hz` at most."""
         if now < self._next_send:
             return False
-        # Almost a period of credit: poses at exactly this rate come early and late, and shall all be sent.
+        # Almost a period of credit: poses at exactly this rate arrive with jitter, and all of them shall be sent.
         period = 1.0 / self.settings.max_rate_hz
         self._next_send = max(self._next_send, now - 0.9 * period) + period
         return True
 
-    def count_sent(self, seen: MeasuredPose, wall: float) -> None:
-        """A pose has gone to its Crazyflie at a Unix time (s)."""
+    def count_sent(self, pose: MeasuredPose, unix_time: float) -> None:
+        """Count a pose that was sent to its Crazyflie at a Unix time (s)."""
         self.sent += 1
-        if seen.stamp:
-            self.latencies.append(wall - seen.stamp)
+        if pose.stamp:
+            self.latencies.append(unix_time - pose.stamp)
 
     def age(self, now: float) -> float:
-        """Seconds since the last pose that was believed; infinite before the first."""
+        """Return the time since the last accepted pose, s; infinite before the first."""
         return math.inf if self.last is None else now - self.last.time
 
-    def rate(self, now: float) -> float:
-        """Poses that were believed in the last second."""
+    def rate_hz(self, now: float) -> float:
+        """Return the number of poses accepted in the last second."""
         return float(sum(1 for t in self._times.copy() if now - t <= 1.0))
 
-    def latency(self, share: float) -> float:
-        """Latency (s) that this share of the last poses kept; 0: unknown."""
+    def latency_quantile(self, share: float) -> float:
+        """Return a quantile of the latencies of the last poses, s; 0: unknown."""
         delays = sorted(self.latencies.copy())
         return delays[int(share * (len(delays) - 1))] if delays else 0.0
 
-    def place(self, now: float) -> Vector | None:
-        """Where the vehicle is (m, world); None: it is not seen, or not any more."""
-        return None if self.last is None or self.age(now) > FRESH_S else self.last.position
+    def measured_position(self, now: float) -> Vector | None:
+        """Return the vehicle's measured position (m, world); None if there is no fresh pose."""
+        return None if self.last is None or self.age(now) > FRESH_POSE_S else self.last.position
 
-    def disagrees(self, believed: Vector, now: float) -> str:
-        """Why a vehicle may not start that believes to be there (m, world); empty if it may."""
-        seen = self.place(now)
-        if seen is None:
+    def why_estimate_wrong(self, estimate: Vector, now: float) -> str:
+        """Return why a vehicle with this estimate of its position (m, world) may not start; empty if it may."""
+        measured = self.measured_position(now)
+        if measured is None:
             return f"is not seen by motion capture ({self.reason or 'no pose comes'})"
-        away = math.dist(seen, believed)
-        if away <= self.settings.agree_m:
+        error = math.dist(measured, estimate)
+        if error <= self.settings.agree_m:
             return ""
-        return f"is seen {away:.2f} m from where it believes to be (limit {self.settings.agree_m:g} m): reconnect it"
+        return f"is seen {error:.2f} m from where it believes to be (limit {self.settings.agree_m:g} m): reconnect it"
 
 
 def outside_room(place: Vector, origin: Vector, room: Room | None) -> str:
-    """How a place (m, world) is outside a room (m, map; None: no limits), with a margin; empty if it is not."""
+    """Return how a place (m, world) is outside a room (m, map; None: no limits), with a margin; empty if it is not."""
     for away, axis in outside_by(to_map(place, origin), *room) if room is not None else ():
         if away > ROOM_MARGIN_M:
             return f"{place_text(place)} in the world is {away:.2f} m outside the room in {axis}"
@@ -236,13 +240,13 @@ def outside_room(place: Vector, origin: Vector, room: Room | None) -> str:
 
 @dataclass(slots=True)
 class SettlingCheck:
-    """Decides when the estimator of a Crazyflie has settled after it was restarted.
+    """Decides when the estimator of a Crazyflie has settled after a restart.
 
-    With motion capture: when its place agrees with where the vehicle is seen. Without: when its variances are small.
-    In both cases the place must be steady, and inside the room.
+    With motion capture, the estimate must agree with the measured position; without, its variances must be small.
+    In both cases the estimate must be steady, and inside the room.
 
     :param variance_limit: m^2.
-    :param agree_m: m, largest distance from where it is seen; None: there is no motion capture.
+    :param agree_m: m, largest distance from the measured position; None: there is no motion capture.
     """
 
     variance_limit: float
@@ -250,34 +254,35 @@ class SettlingCheck:
     room: Room | None
     agree_m: float | None
     problem: str = "nothing is known about it"
-    _places: deque[Vector] = field(default_factory=lambda: deque(maxlen=SAMPLES))
+    _places: deque[Vector] = field(default_factory=lambda: deque(maxlen=SETTLED_SAMPLES))
 
     def restart(self) -> None:
-        """The filter was restarted: what was logged before does not count."""
+        """Forget all samples: the filter was restarted."""
         self.problem = "the firmware logs nothing about it"
         self._places.clear()
 
-    def sample(self, place: Vector, variances: Vector, seen: Vector | None) -> bool:
-        """Take in what the firmware logs (m, world; m^2), and where it is seen; True once it has settled."""
+    def add_sample(self, place: Vector, variances: Vector, measured: Vector | None) -> bool:
+        """Add a logged estimate (m, world), its variances (m^2) and the measured position; True once it has settled."""
         self._places.append(place)
-        self.problem = self._what_is_wrong(place, variances, seen)
+        self.problem = self._find_problem(place, variances, measured)
         return not self.problem
 
-    def _what_is_wrong(self, place: Vector, variances: Vector, seen: Vector | None) -> str:
+    def _find_problem(self, place: Vector, variances: Vector, measured: Vector | None) -> str:
         where = place_text(place)
         if not all(math.isfinite(v) for v in (*place, *variances)):
             return f"its estimate is not finite {where}"
         if self.agree_m is not None:
-            if seen is None:
+            if measured is None:
                 return "motion capture does not see it"
-            away = math.dist(place, seen)
-            if away > self.agree_m:
-                return f"it believes to be at {where}, motion capture sees it {away:.2f} m away at {place_text(seen)}"
+            error = math.dist(place, measured)
+            if error > self.agree_m:
+                at = place_text(measured)
+                return f"it believes to be at {where}, motion capture sees it {error:.2f} m away at {at}"
         elif max(variances) > self.variance_limit:
             return f"variance {max(variances):.3g} m^2, limit {self.variance_limit:g} m^2, at {where}"
         if outside := outside_room(place, self.origin, self.room):
             return f"it believes to be outside: {outside}"
         spread = max(math.dist(place, p) for p in self._places)
-        if len(self._places) < SAMPLES or spread > STEADY_M:
+        if len(self._places) < SETTLED_SAMPLES or spread > SETTLED_SPREAD_M:
             return f"its place moves by {spread:.2f} m, at {where}"
         return ""

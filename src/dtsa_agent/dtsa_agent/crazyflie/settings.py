@@ -1,4 +1,4 @@
-"""The swarm's YAML: robots, their types, and what holds for all. A robot's value beats its type's, which beats `all`.
+"""The swarm's YAML: robots, robot types, common values. A robot's value overrides its type's, which overrides `all`.
 
 robots:
   cf1: {uri: radio://0/80/2M/E7E7E7E701, initial_position: [1.2, 0.0, 0.0], type: cf21}
@@ -33,14 +33,14 @@ from .safety import SafetySettings
 from .state import Vector
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-NUMBER = re.compile(r"\d+$")
-PLACE_M = 0.25  # m: an agent on board may stand this far beside its place
+TRAILING_NUMBER = re.compile(r"\d+$")
+MAX_START_OFFSET_M = 0.25  # of an agent on board from its start in the scenario
 SECTIONS = ("fileversion", "robots", "robot_types", "all", "station")
 
 
 @dataclass(frozen=True, slots=True)
 class BatterySettings(Settings):
-    """Voltages of a battery: Crazyswarm2's two on the ground, two of this bridge in flight."""
+    """Voltage limits of a battery: two on the ground, as in Crazyswarm2, and two in flight."""
 
     voltage_warning: float = setting(3.4, "on the ground: warning below this", unit="V", minimum=2.0, maximum=5.0)
     voltage_critical: float = setting(3.2, "on the ground: no take-off below this", unit="V", minimum=2.0, maximum=5.0)
@@ -101,11 +101,11 @@ class RobotSettings(Settings):
         check(self)
         object.__setattr__(self, "uri", str(self.uri))
         parse_address(self.uri)
-        object.__setattr__(self, "firmware_params", _params(self.firmware_params))
+        object.__setattr__(self, "firmware_params", _flatten_parameters(self.firmware_params))
 
     @property
     def address(self) -> Address:
-        """Where it is reached."""
+        """The URI's parts."""
         return parse_address(self.uri)
 
 
@@ -147,25 +147,25 @@ class SwarmSettings:
 
     @property
     def swarm(self) -> SwarmConfig | None:
-        """What the agents on board share; None: the bridge steers; ConfigError: it is not usable."""
-        given = self.station.on_board
-        if not given.on:
+        """Settings that the agents on board share; None if the bridge steers; ConfigError: they are not usable."""
+        on_board = self.station.on_board
+        if not on_board.enabled:
             return None
         with named("station.on_board.swarm"):
-            swarm = SwarmConfig.from_dict({**given.swarm, "agents": len(self.robots)})
+            swarm = SwarmConfig.from_dict({**on_board.swarm, "agents": len(self.robots)})
             check_onboard_swarm(swarm)
             return swarm
 
     @property
     def loads(self) -> list[RadioLoad]:
-        """What radios and channels have to carry."""
-        positions = self.station.positions.max_rate_hz if self.station.positions.on else 0.0
+        """Packets that each radio has to carry."""
+        positions = self.station.positions.max_rate_hz if self.station.positions.enabled else 0.0
         return radio_loads(
             RadioUser(r.name, r.address, r.command_rate_hz + positions, r.log_rate_hz) for r in self.robots
         )
 
-    def summary(self) -> list[str]:
-        """What the file asks for, in lines: radios, and keys that mean nothing here."""
+    def describe(self) -> list[str]:
+        """Return lines for the operator: load of each radio, and keys that have no meaning here."""
         lines = [str(load) for load in self.loads]
         if wired := sum(not robot.address.radio for robot in self.robots):
             lines.append(f"{wired} Crazyflies without a radio (udp, usb): no budget")
@@ -180,28 +180,28 @@ def load_swarm(path: Path) -> SwarmSettings:
 
 
 def parse_swarm(data: object) -> SwarmSettings:
-    """Settings from the contents of a swarm's YAML; ConfigError: something in it is not usable."""
-    top = _mapping("config", data)
+    """Check the contents of a swarm's YAML; ConfigError: something in it is not usable."""
+    top = _check_mapping("config", data)
     unused = [str(key) for key in top if key not in SECTIONS]
-    types = _mapping("robot_types", top.get("robot_types"))
-    common = _mapping("all", top.get("all"))
+    types = _check_mapping("robot_types", top.get("robot_types"))
+    common = _check_mapping("all", top.get("all"))
     enabled = {}
-    for name, own in _mapping("robots", top.get("robots")).items():
-        values = _mapping(f"robots.{name}", own)
+    for name, own in _check_mapping("robots", top.get("robots")).items():
+        values = _check_mapping(f"robots.{name}", own)
         if values.get("enabled", common.get("enabled", True)) is not False:
             enabled[str(name)] = values
     if not enabled:
         raise ConfigError("robots", list(top.get("robots") or ()), "at least one robot that is enabled")
-    merged = {name: _merged(name, own, types, common, unused) for name, own in enabled.items()}
-    ids = _ids(merged)
+    merged = {name: _merge_robot(name, values, types, common, unused) for name, values in enabled.items()}
+    ids = _assign_ids(merged)
     robots = []
-    for name, own in merged.items():
+    for name, values in merged.items():
         with named(f"robots.{name}"):
-            robots.append(build(RobotSettings, own | {"name": name, "id": ids[name]}))
+            robots.append(build(RobotSettings, values | {"name": name, "id": ids[name]}))
     robots.sort(key=lambda robot: robot.id)
     check_distinct([(robot.name, robot.address) for robot in robots])
     with named("station"):
-        station = GroundStationSettings.from_dict(_without_empty(_mapping("station", top.get("station"))))
+        station = GroundStationSettings.from_dict(_without_empty(_check_mapping("station", top.get("station"))))
     if station.min_connected > len(robots):
         raise ConfigError("station.min_connected", station.min_connected, f"1 to {len(robots)}, the enabled robots")
     settings = SwarmSettings(tuple(robots), station, tuple(dict.fromkeys(unused)))
@@ -211,13 +211,13 @@ def parse_swarm(data: object) -> SwarmSettings:
 
 
 def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
-    """Check that robots and station fit to agents on board."""
-    station, (x, y, _) = settings.station, settings.station.room_origin_in_world
+    """Check robots and station for a swarm whose agents run on board."""
+    station, (x_origin, y_origin, _) = settings.station, settings.station.room_origin_in_world
     rate = station.on_board.polls_hz
-    if station.positions.on:
+    if station.positions.enabled:
         allowed = f"{NONE} with on_board: poses to the Crazyflies would take their air"
         raise ConfigError("station.positions.source", station.positions.source, allowed)
-    if x or y:
+    if x_origin or y_origin:
         allowed = "0, 0, z with on_board: the app knows a height alone"
         raise ConfigError("station.room_origin_in_world", list(station.room_origin_in_world), allowed)
     if station.safety.min_distance_m:
@@ -231,12 +231,13 @@ def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
             allowed = f"at most {rate / 2:g} Hz with on_board.polls_hz {rate:g}: a packet comes with every second poll"
             raise ConfigError(f"robots.{robot.name}.log_rate_hz", robot.log_rate_hz, allowed)
         place = robot.initial_position
-        if math.dist(place[:2], start[:2, index]) > PLACE_M:
-            allowed = f"within {PLACE_M} m of ({start[0, index]:.2f}, {start[1, index]:.2f}), where the swarm begins"
+        if math.dist(place[:2], start[:2, index]) > MAX_START_OFFSET_M:
+            x, y = start[:2, index]
+            allowed = f"within {MAX_START_OFFSET_M} m of ({x:.2f}, {y:.2f}), where the swarm begins"
             raise ConfigError(f"robots.{robot.name}.initial_position", list(place), allowed)
 
 
-def _mapping(field: str, value: object) -> dict[str, Any]:
+def _check_mapping(field: str, value: object) -> dict[str, Any]:
     if value is None:
         return {}
     if not isinstance(value, dict):
@@ -250,42 +251,43 @@ def _without_empty(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _merge(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested mappings, `high` beats `low`."""
+    """Merge nested mappings; values of `high` override those of `low`."""
     result = dict(low)
     for key, value in high.items():
-        both = isinstance(value, dict) and isinstance(result.get(key), dict)
-        result[key] = _merge(result[key], value) if both else value
+        both_nested = isinstance(value, dict) and isinstance(result.get(key), dict)
+        result[key] = _merge(result[key], value) if both_nested else value
     return result
 
 
-def _merged(
+def _merge_robot(
     name: str, own: dict[str, Any], types: dict[str, Any], common: dict[str, Any], unused: list[str]
 ) -> dict[str, Any]:
-    """One robot's values, with those of its type and of all; keys that mean nothing here are added to `unused`."""
+    """Merge one robot's values with those of its type and of all; keys without meaning are added to `unused`."""
     if NAME.fullmatch(name) is None:
         raise ConfigError("robots", name, "names of letters, digits and underscores that do not begin with a digit")
-    kind = own.get("type", "")
-    if kind and kind not in types:
+    robot_type = own.get("type", "")
+    if robot_type and robot_type not in types:
         allowed = "one of robot_types: " + (", ".join(map(str, types)) or "(there are none)")
-        raise ConfigError(f"robots.{name}.type", kind, allowed)
-    known = {spec.name for spec in settings_of(RobotSettings)} - {"name"}
-    levels = [("all", common), (f"robot_types.{kind}", _mapping(f"robot_types.{kind}", types.get(kind)))]
+        raise ConfigError(f"robots.{name}.type", robot_type, allowed)
+    setting_names = {spec.name for spec in settings_of(RobotSettings)} - {"name"}
+    type_field = f"robot_types.{robot_type}"
+    levels = [("all", common), (type_field, _check_mapping(type_field, types.get(robot_type))), (f"robots.{name}", own)]
     result: dict[str, Any] = {}
-    for where, values in (*levels, (f"robots.{name}", own)):
+    for level, values in levels:
         battery = values.get("battery")
         if isinstance(battery, dict):
-            unused += [f"{where}.battery.{key}" for key in battery if key not in BATTERY_KEYS]
+            unused += [f"{level}.battery.{key}" for key in battery if key not in BATTERY_KEYS]
             values = values | {"battery": {key: value for key, value in battery.items() if key in BATTERY_KEYS}}
-        unused += [f"{where}.{key}" for key in values if key not in known]
-        result = _merge(result, _without_empty({key: value for key, value in values.items() if key in known}))
+        unused += [f"{level}.{key}" for key in values if key not in setting_names]
+        result = _merge(result, _without_empty({key: value for key, value in values.items() if key in setting_names}))
     return result
 
 
-def _ids(robots: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """Agents' ids by the robots' names: those given, else numbers of names that are 1 to N, else the file's order."""
-    numbers = {name: int(match[0]) if (match := NUMBER.search(name)) else 0 for name in robots}
+def _assign_ids(robots: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
+    """Return ids by robots' names: `id` of the file, else the names' numbers if 1 to N, else the file's order."""
+    numbers = {name: int(match[0]) if (match := TRAILING_NUMBER.search(name)) else 0 for name in robots}
     if sorted(numbers.values()) != list(range(1, len(robots) + 1)):
-        numbers = {name: place for place, name in enumerate(robots, 1)}
+        numbers = {name: position for position, name in enumerate(robots, 1)}
     ids: dict[str, int] = {}
     for name, own in robots.items():
         ids[name] = own.get("id", numbers[name])
@@ -295,11 +297,11 @@ def _ids(robots: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
     return ids
 
 
-def _params(groups: object) -> dict[str, float]:
-    """Parameters of the firmware as `group.name`; they stay whole numbers where they are."""
+def _flatten_parameters(groups: object) -> dict[str, float]:
+    """Check parameters of the firmware, {group: {name: value}}; return them by `group.name`. Integers stay integers."""
     result: dict[str, float] = {}
-    for group, names in _mapping("firmware_params", groups).items():
-        for name, value in _mapping(f"firmware_params.{group}", names).items():
+    for group, names in _check_mapping("firmware_params", groups).items():
+        for name, value in _check_mapping(f"firmware_params.{group}", names).items():
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                 raise ConfigError(f"firmware_params.{group}.{name}", value, "a number")
             result[f"{group}.{name}"] = value

@@ -1,19 +1,18 @@
-"""What a Crazyflie reports, in ROS's units (REP-103: m, rad, x forward, y left, z up), and the states it goes through.
+"""State reports of a Crazyflie in ROS's units (REP-103: m, rad, x forward, y left, z up), and its state machine.
 
-What the firmware does differently: the compressed state log counts in mm, mm/s and mrad/s; pitch in
-`stateEstimate.pitch` has the opposite sign (nose up is positive there, nose down in REP-103). Commands to it are
-converted in `commands`.
+The firmware differs: its compressed state log counts in mm, mm/s and mrad/s, and `stateEstimate.pitch` has the opposite
+sign (nose up is positive there, nose down in REP-103). Module `commands` converts commands to the firmware.
 
-The states, as the ground station sees them:
+States, as the ground station sees them:
 
     disconnected --> connecting --> ready <--> armed --> flying --> landing --> ready
                                       |          |         |           |
                                       +----------+---------+-----------+--> lost       (silent for too long)
                                       +----------+---------+-----------+--> emergency  (motors stopped for good)
 
-What the firmware's supervisor reports decides between ready, armed and flying; orders decide about landing. A Crazyflie
-that arms itself (2.1, 2.1+) is ready until the ground station orders to arm it, and again once it has landed. `lost`
-ends when the Crazyflie is heard again, `emergency` only with a new connection.
+Reports of the firmware's supervisor decide between ready, armed and flying; orders decide about landing. A Crazyflie
+that arms itself (2.1, 2.1+) is ready until the ground station orders it to arm, and again once it has landed. `lost`
+ends with the next packet from the Crazyflie, `emergency` only with a new connection.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from dtsa_agent.core.errors import LocalProtocolError
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
 
-# One log block of 20 bytes has everything; a block may have 26.
+# All fit in one log block: 20 of at most 26 bytes.
 LOG_VARIABLES = (
     *(f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz", "quat")), "pm.vbatMV", "supervisor.info",
 )  # fmt: skip
@@ -36,7 +35,7 @@ LOG_VARIABLES = (
 
 @dataclass(frozen=True, slots=True)
 class VehicleState:
-    """What a Crazyflie reports about itself."""
+    """One state report of a Crazyflie."""
 
     position: Vector  # m, world
     velocity: Vector  # m/s, world
@@ -46,7 +45,7 @@ class VehicleState:
 
 
 def decode_log(values: Mapping[str, float]) -> VehicleState:
-    """State from the values of one log packet.
+    """Return the state report in one log packet.
 
     :param values: by the names in `LOG_VARIABLES`, in the firmware's units.
     """
@@ -56,10 +55,10 @@ def decode_log(values: Mapping[str, float]) -> VehicleState:
 
 
 def decompress_quaternion(bits: int) -> Quaternion:
-    """Unit quaternion (x, y, z, w) from the firmware's 32 bits (quatcompress.h).
+    """Return the unit quaternion (x, y, z, w) in the firmware's 32 bits (quatcompress.h).
 
-    The upper two bits say which component is the largest; it is positive and follows from the others, which take ten
-    bits each: sign, then the size in 511ths of 1/sqrt(2).
+    The upper two bits are the index of the largest component, which is positive and follows from the others. Each of
+    these has ten bits: the sign, then the magnitude in 511ths of 1/sqrt(2).
     """
     largest = bits >> 30
     q = [0.0, 0.0, 0.0, 0.0]
@@ -75,47 +74,47 @@ def decompress_quaternion(bits: int) -> Quaternion:
 
 
 def yaw_of(q: Quaternion) -> float:
-    """Heading (rad) of an orientation (x, y, z, w)."""
+    """Return the heading (rad) of an orientation (x, y, z, w)."""
     x, y, z, w = q
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def to_world(place: Vector, origin: Vector) -> Vector:
-    """From the frame `map` (the room's centre) to the Crazyflies' world, which sees the origin of `map` at `origin`."""
+    """Convert from frame `map` (the room's centre) to the Crazyflies' world, in which `map` begins at `origin`."""
     return place[0] + origin[0], place[1] + origin[1], place[2] + origin[2]
 
 
 def to_map(place: Vector, origin: Vector) -> Vector:
-    """From the Crazyflies' world to the frame `map`; the inverse of `to_world`."""
+    """Convert from the Crazyflies' world to frame `map`; the inverse of `to_world`."""
     return place[0] - origin[0], place[1] - origin[1], place[2] - origin[2]
 
 
 def outside_by(place: Vector, low: Vector, high: Vector) -> list[tuple[float, str]]:
-    """How far a place is outside a box along each axis, m (negative: inside), and the axis's name."""
+    """Return how far a place is outside a box along each axis, m (negative: inside), with the axis's name."""
     return [(max(a - p, p - b), axis) for p, a, b, axis in zip(place, low, high, "xyz", strict=True)]
 
 
 def place_text(place: Vector) -> str:
-    """A place (m) for people."""
+    """Format a place (m) to the centimetre."""
     return "(" + ", ".join(f"{round(v, 2) + 0.0:.2f}" for v in place) + ")"  # no -0.00
 
 
 def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
-    """Turn a vector from the world's axes into those of a body with this orientation."""
+    """Rotate a vector from world axes to the axes of a body with this orientation."""
     x, y, z, w = -q[0], -q[1], -q[2], q[3]
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
     return (v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx)
 
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
-    """Turn a vector from the axes of a body with this orientation into the world's."""
+    """Rotate a vector from the axes of a body with this orientation to world axes."""
     return rotate_inverse((-q[0], -q[1], -q[2], q[3]), v)
 
 
 # -- states ---------------------------------------------------------------------------------------------------------
 CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
 IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
-HL_ACTIVE = 256  # the high-level commander has something to fly
+HL_ACTIVE = 256  # the high-level commander flies a trajectory
 
 
 class State(enum.IntEnum):
@@ -134,7 +133,7 @@ class State(enum.IntEnum):
 S = State
 CONNECTED = frozenset({S.READY, S.ARMED, S.FLYING, S.LANDING, S.EMERGENCY})
 IN_AIR = frozenset({S.FLYING, S.LANDING})
-ALLOWED: dict[State, frozenset[State]] = {
+TRANSITIONS: dict[State, frozenset[State]] = {
     S.DISCONNECTED: frozenset({S.CONNECTING}),
     S.CONNECTING: frozenset({S.READY, S.ARMED, S.FLYING, S.DISCONNECTED, S.EMERGENCY}),
     S.READY: frozenset({S.ARMED, S.FLYING, S.LANDING, S.EMERGENCY, S.LOST, S.DISCONNECTED}),
@@ -147,82 +146,82 @@ ALLOWED: dict[State, frozenset[State]] = {
 
 
 class StateMachine:
-    """State of one Crazyflie, and why it is in it.
+    """State of one Crazyflie, and the reason for it.
 
-    :param changed: called with the state before, the state now and the reason.
+    :param on_change: called with the state before, the state now and the reason.
     """
 
-    def __init__(self, changed: Callable[[State, State, str], None]) -> None:
+    def __init__(self, on_change: Callable[[State, State, str], None]) -> None:
         self.state = S.DISCONNECTED
         self.reason = "not connected yet"
-        self._changed = changed
-        self.arms_itself = False  # the firmware says so
-        self._wanted = False  # the ground station wants it armed: of one that arms itself nothing else can tell
+        self._on_change = on_change
+        self.arms_itself = False  # reported by the firmware
+        self._arming_ordered = False  # decides whether a Crazyflie that arms itself counts as armed
         self._landing = False  # a landing was ordered and is not over
         self._stopped = False  # an emergency stop was sent
 
-    def go(self, state: State, reason: str) -> None:
-        """Enter a state; LocalProtocolError: there is no way from the present state to that one."""
+    def enter(self, state: State, reason: str) -> None:
+        """Enter a state; LocalProtocolError: the present state has no transition to it."""
         if state == self.state:
             return
-        if state not in ALLOWED[self.state]:
-            raise LocalProtocolError(f"no way from {self.state.name} to {state.name}")
+        if state not in TRANSITIONS[self.state]:
+            raise LocalProtocolError(f"no transition from {self.state.name} to {state.name}")
         before, self.state, self.reason = self.state, state, reason
         if state in (S.CONNECTING, S.DISCONNECTED):
-            self._landing = self._stopped = self._wanted = False
-        self._changed(before, state, reason)
+            self._landing = self._stopped = self._arming_ordered = False
+        self._on_change(before, state, reason)
 
-    def arm(self, wanted: bool) -> None:
-        """Arming or disarming was ordered."""
-        self._wanted = wanted
+    def note_arming(self, armed: bool) -> None:
+        """Note that arming or disarming was ordered."""
+        self._arming_ordered = armed
 
-    def takeoff(self, reason: str) -> None:
-        """A take-off was ordered: an earlier landing is over."""
+    def note_takeoff(self, reason: str) -> None:
+        """Note that a take-off was ordered: an earlier landing is over."""
         self._landing = False
         if self.state == S.LANDING:
-            self.go(S.FLYING, reason)
+            self.enter(S.FLYING, reason)
         self.reason = reason
 
-    def land(self, reason: str) -> None:
-        """A landing was ordered."""
+    def note_landing(self, reason: str) -> None:
+        """Note that a landing was ordered."""
         self._landing = True
         if self.state in (S.FLYING, S.ARMED, S.READY):
-            self.go(S.LANDING, reason)
+            self.enter(S.LANDING, reason)
 
-    def emergency(self, reason: str) -> None:
-        """An emergency stop was ordered."""
+    def note_emergency_stop(self, reason: str) -> None:
+        """Note that an emergency stop was ordered."""
         self._stopped = True
         if self.state not in (S.DISCONNECTED, S.CONNECTING):
-            self.go(S.EMERGENCY, reason)
+            self.enter(S.EMERGENCY, reason)
 
-    def silent(self, reason: str) -> None:
-        """Nothing was heard for too long, or the link broke."""
+    def note_lost_link(self, reason: str) -> None:
+        """Note that no packet arrived for too long, or that the link broke."""
         if self.state in CONNECTED:
-            self.go(S.LOST, reason)
+            self.enter(S.LOST, reason)
 
-    def observe(self, info: int) -> None:
-        """Follow the supervisor's bits in a log packet."""
+    def update(self, info: int) -> None:
+        """Enter the state that the supervisor's bits in a log packet show."""
         if self.state in (S.DISCONNECTED, S.EMERGENCY):
             return
         troubles = (IS_LOCKED, "locked after an emergency stop"), (IS_TUMBLED, "tumbled"), (IS_CRASHED, "crashed")
         reasons = [reason for bit, reason in troubles if info & bit]
         if reasons or self._stopped:
-            self.go(S.EMERGENCY, reasons[0] if reasons else self.reason)
+            self.enter(S.EMERGENCY, reasons[0] if reasons else self.reason)
             return
         self.arms_itself = bool(info & AUTO_ARM)
-        back = "heard again" if self.state == S.LOST else ""
+        reason = "heard again" if self.state == S.LOST else ""
         if info & IS_FLYING:
             if not self._landing:
-                self.go(S.FLYING, back or "in the air")
+                self.enter(S.FLYING, reason or "in the air")
             elif self.state != S.LANDING:
-                self.go(S.LANDING, back or self.reason)
+                self.enter(S.LANDING, reason or self.reason)
             return
         if self.state == S.LANDING or (self.state == S.LOST and self._landing):
-            back = "landed"
+            reason = "landed"
         if self.state in IN_AIR or self._landing:
-            self._wanted = False
+            self._arming_ordered = False
         self._landing = False
-        if self._wanted if self.arms_itself else info & IS_ARMED:
-            self.go(S.ARMED, back or "armed")
+        if self._arming_ordered if self.arms_itself else info & IS_ARMED:
+            self.enter(S.ARMED, reason or "armed")
         else:
-            self.go(S.READY, back or "motors locked")
+            self.enter(S.READY, reason or "motors locked")

@@ -77,12 +77,14 @@ class CrazyflieVehicle:
         safety, positions, origin = station.safety, station.positions, station.room_origin_in_world
         room = (safety.geofence_min, safety.geofence_max) if safety.geofence else None
         self.tracker = (
-            PoseTracker(positions, origin, room) if positions.on else None
+            PoseTracker(positions, origin, room) if positions.enabled else None
         )  # None: there is no motion capture
         self._watch = EstimateWatch(safety.estimate_jump_m, safety.estimate_freeze_s, safety.estimate_error_m)
-        settling = SettlingCheck(robot.estimator_variance_m2, origin, room, positions.agree_m if positions.on else None)
-        seen = lambda: self._measured_place(time.monotonic())  # noqa: E731
-        self.link = CrazyflieLink(robot, cache, self._on_state, self._on_broken, self._on_answer, settling, seen)
+        settling = SettlingCheck(
+            robot.estimator_variance_m2, origin, room, positions.agree_m if positions.enabled else None
+        )
+        measured = lambda: self._measured_place(time.monotonic())  # noqa: E731
+        self.link = CrazyflieLink(robot, cache, self._on_state, self._on_broken, self._on_answer, settling, measured)
         self.controls = Controls(self.link, station, self.machine, self.lock, self._log_info)
 
     @property
@@ -121,7 +123,7 @@ class CrazyflieVehicle:
                 self._log("error", f"{self.name}: {self._watch.wrong}")
             if self.state not in OFF:
                 before = self.state
-                self.machine.observe(state.info)
+                self.machine.update(state.info)
                 if before == State.LOST != self.state:
                     self._resume_after_gap(state)
         if self._publish is not None:
@@ -150,33 +152,33 @@ class CrazyflieVehicle:
 
     def _on_broken(self, reason: str) -> None:
         with self.lock:
-            self.machine.silent(reason)
+            self.machine.note_lost_link(reason)
 
     def receive_pose(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> None:
-        """A pose from motion capture (see `PoseTracker.offer`): checked, and passed on to the Crazyflie."""
+        """Check a pose from motion capture (see `PoseTracker.receive_pose`), and pass it on to the Crazyflie."""
         tracker, now = self.tracker, time.monotonic()
         if tracker is None:
             return
         with self.lock:
             flying = self.last is not None and bool(self.last.info & IS_FLYING)
-            problem = tracker.offer(position, orientation, frame, stamp, now, flying=flying)
+            problem = tracker.receive_pose(position, orientation, frame, stamp, now, flying=flying)
             if problem and now - self._complained > COMPLAIN_S:
                 self._complained = now
                 self._log("warn", f"{self.name}: a pose of motion capture is refused: {problem}")
-            due = not problem and tracker.due(now)
+            due = not problem and tracker.is_due(now)
         if due:
             self.link.send_position(position_order(tracker))
 
     # -- what is known of it ----------------------------------------------------------------------------------------
     def _measured_place(self, now: float) -> Vector | None:
-        """Where motion capture sees it; None: not at all, or not any more."""
-        return None if self.tracker is None else self.tracker.place(now)
+        """Return the position that motion capture measures (m, world); None if there is no fresh pose."""
+        return None if self.tracker is None else self.tracker.measured_position(now)
 
     def _why_misplaced(self) -> str:
         """Why its motors may not start: it does not know where it stands. Empty if it does."""
         if self.tracker is None or self.last is None:
             return ""
-        problem = self.tracker.disagrees(self.last.position, time.monotonic())
+        problem = self.tracker.why_estimate_wrong(self.last.position, time.monotonic())
         return f"{self.name} {problem}" if problem else ""
 
     @property
@@ -221,7 +223,7 @@ class CrazyflieVehicle:
     def connect(self, done: Callable[[], None]) -> None:
         """Connect in a thread of its own; `done` is called when it has worked out or not."""
         with self.lock:
-            self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
+            self.machine.enter(State.CONNECTING, f"connecting to {self.robot.uri}")
             self.guarded = False
             self.controls.reset()
 
@@ -231,11 +233,11 @@ class CrazyflieVehicle:
                 with self.lock:
                     if reason:
                         self._log("error", f"{self.name}: no connection: {reason}")
-                        self.machine.go(State.DISCONNECTED, reason)
+                        self.machine.enter(State.DISCONNECTED, reason)
                     else:
-                        self.machine.go(State.READY, "connected")
+                        self.machine.enter(State.READY, "connected")
                         if self.last is not None:
-                            self.machine.observe(self.last.info)
+                            self.machine.update(self.last.info)
             finally:
                 done()
 
@@ -259,12 +261,12 @@ class CrazyflieVehicle:
             if arm and (problem := self._why_misplaced()):
                 return problem
             self.action = "arming" if arm else "disarming"
-            self.machine.arm(arm)
+            self.machine.note_arming(arm)
             self.controls.moved = False
             if not self.machine.arms_itself:  # disarmed, it would arm itself again at once
                 self.link.order(lambda cf: cf.supervisor.send_arming_request(arm))
             elif self.last is not None:
-                self.machine.observe(self.last.info)
+                self.machine.update(self.last.info)
             return ""
 
     def takeoff(self, height: float, duration: float) -> str:
@@ -292,10 +294,12 @@ class CrazyflieVehicle:
             if arms and (problem := self.arm(True)):
                 return problem
             self.controls.overruled, self.controls.moved = False, True
-            if self.station.on_board.on:  # the app had been overruled by the last landing: it has to be enabled anew
+            if (
+                self.station.on_board.enabled
+            ):  # the app had been overruled by the last landing: it has to be enabled anew
                 self.link.set_parameter(ENABLE, 0)
             self.controls.end_blind_flight()
-            self.machine.takeoff(f"take-off to {height:.2f} m")
+            self.machine.note_takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
             if on_ground or last is None:
                 self.controls.streaming = True  # an old stream may still be in force
@@ -396,7 +400,7 @@ class CrazyflieVehicle:
             self.action = f"land: {reason}"
             # A blind landing must end a stream that the firmware may still follow.
             controls.streaming |= self.state == State.LOST
-            self.machine.land(self.action)
+            self.machine.note_landing(self.action)
             if self._watch.wrong:
                 now = time.monotonic()
                 seen = self._measured_place(now)
@@ -426,7 +430,7 @@ class CrazyflieVehicle:
             self.controls.stop()
             for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
                 self.link.order(lambda cf: cf.supervisor.send_emergency_stop())
-            self.machine.emergency(self.action)
+            self.machine.note_emergency_stop(self.action)
 
     def notify_setpoints_stop(self, remain_ms: int) -> str:
         """End the stream of setpoints and hold; the last one stays valid for `remain_ms`."""
@@ -446,7 +450,7 @@ class CrazyflieVehicle:
         """It is silent. Nothing may be heard, but a landing is ordered all the same, unless it is known to land."""
         with self.lock:
             was_in_air = self.state in IN_AIR
-            self.machine.silent(reason)
+            self.machine.note_lost_link(reason)
             if not was_in_air:
                 self.controls.delivery.cancel()  # a take-off that comes late would surprise
             elif self.link.connected and not self.controls.delivery.landing:
@@ -478,15 +482,15 @@ class CrazyflieVehicle:
 
 
 def position_order(tracker: PoseTracker) -> Send:
-    """Tell a Crazyflie the last pose that is believed."""
-    seen = tracker.last
-    assert seen is not None
+    """Return an order that sends a Crazyflie the last accepted pose."""
+    pose = tracker.last
+    assert pose is not None
 
     def send(cf: Any) -> None:
-        if tracker.settings.send == EXTPOSE and seen.orientation is not None:
-            cf.loc.send_extpose(seen.position, seen.orientation)
+        if tracker.settings.send == EXTPOSE and pose.orientation is not None:
+            cf.loc.send_extpose(pose.position, pose.orientation)
         else:
-            cf.loc.send_extpos(seen.position)
-        tracker.count_sent(seen, time.time())
+            cf.loc.send_extpos(pose.position)
+        tracker.count_sent(pose, time.time())
 
     return send

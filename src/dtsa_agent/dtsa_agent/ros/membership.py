@@ -114,7 +114,7 @@ class Membership:
         try:
             call = Call.from_bytes(data)
         except ValueError as error:
-            raise BadMessage(checks.RANGE, f"a call of nobody: {error}") from None
+            raise BadMessage(checks.RANGE, f"an unreadable call: {error}") from None
         while len(self._callers) >= _MOST_CALLERS:
             del self._callers[next(run for run in self._callers if run != self.run)]
         caller = self._callers[run] = _Caller(call, PublisherGuard(sender))

@@ -14,7 +14,7 @@ from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
+from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
 from dtsa_agent.core.settings.declaration import Setting, Settings, setting
 from dtsa_agent.keys import authenticator, with_key
 from dtsa_agent.priority import PrioritySettings, set_nice
@@ -95,7 +95,7 @@ def host_agents(
     :param spaces: namespace of each agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
     :raises ConfigError: for settings that are not usable.
     """
-    if shared and not shareable(config):
+    if shared and not can_share_table(config):
         raise ConfigError("shared_table", True, f"false with policy {config.policy}")
     host = HostSettings(**declare_settings(node, HostSettings))
     priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority

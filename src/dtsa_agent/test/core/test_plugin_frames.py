@@ -32,10 +32,10 @@ class Counting:
     def choose(self, table: Table, slot: int) -> int:
         return slot % self.agents + 1
 
-    def say(self, table: Table, slot: int) -> bytes:
+    def own_data(self, table: Table, slot: int) -> bytes:
         return struct.pack("<HH", self.agent, self.count)
 
-    def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
+    def receive_data(self, table: Table, slot: int, sender: int, data: bytes) -> None:
         agent, count = struct.unpack("<HH", data)
         assert agent == sender
         assert table.sent_slot[sender - 1] == slot
@@ -57,10 +57,10 @@ class Initials:
     def estimate(self, table: Table, slot: int, step: int, position: Any, velocity: Any) -> None:
         position[:], velocity[:] = table.sent_position, table.sent_velocity
 
-    def say(self, table: Table, slot: int) -> bytes:
+    def own_data(self, table: Table, slot: int) -> bytes:
         return bytes([65 + table.agent, 97 + slot % 26])
 
-    def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
+    def receive_data(self, table: Table, slot: int, sender: int, data: bytes) -> None:
         self.letters[sender] = data
 
 
@@ -176,7 +176,7 @@ def test_bytes_that_do_not_fit_are_refused_and_broken_promises_named(monkeypatch
     assert config(frame="extended", estimator="linear").own_bytes == 4
     with pytest.raises(ConfigError, match="own_bytes of counting: got 4; allowed: 0 to 0"):
         config(frame="extended", estimator="linear", auth=True)
-    monkeypatch.setattr(Counting, "say", lambda self, table, slot: b"abc")
+    monkeypatch.setattr(Counting, "own_data", lambda self, table, slot: b"abc")
     swarm = make_swarm(config())
-    with pytest.raises(PluginError, match="policy counting, say: gave 3 bytes, declared 4"):
+    with pytest.raises(PluginError, match="policy counting, own_data: gave 3 bytes, declared 4"):
         swarm.begin(0)

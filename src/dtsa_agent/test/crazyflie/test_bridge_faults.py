@@ -237,7 +237,7 @@ def check_parameters(one: CrazyflieVehicle, two: CrazyflieVehicle) -> None:
         ("hlCommander.vland", float("nan"), "hlCommander.vland: nan is not a number"),
         ("firmware.modified", 1, "firmware.modified is read-only"),
     ):
-        assert known[name].problem(value) == problem
+        assert known[name].why_refused(value) == problem
     one.link.set_parameter("ring.effect", 7)
     wait_for(lambda: read_parameters(one.link)["ring.effect"].value == 7)
     assert read_parameters(two.link)["ring.effect"].value == 6

@@ -100,7 +100,7 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         # Groups: nobody is in the fourth, cf3 alone is in the second.
         here = Point(x=graph.place(3)[0], y=graph.place(3)[1], z=1.05)
         answer = graph.call(GoTo, "/all/go_to", group_mask=4, goal=here, duration=Duration(sec=1))
-        assert (answer.success, answer.message) == (False, "nobody of cf1, cf2, cf3 is in a group of 4")
+        assert (answer.success, answer.message) == (False, "none of cf1, cf2, cf3 is in a group of 4")
         assert graph.call(GoTo, "/all/go_to", group_mask=2, goal=here, duration=Duration(sec=1)).success
         goal = pytest.approx([here.x, here.y, here.z], abs=0.002)
         wait_for(lambda: any(event["goal"] == goal for event in fleet.events(3, "go_to")))

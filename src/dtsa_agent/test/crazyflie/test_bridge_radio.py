@@ -111,7 +111,7 @@ def test_who_else_sends_on_the_channel_is_warned_of(tmp_path: Path) -> None:
         _,
         pilot,
     ):
-        wait_for(lambda: any("does somebody else send there?" in line for _, _, line in pilot.lines), 30.0)
+        wait_for(lambda: any("does another transmitter use its channel?" in line for _, _, line in pilot.lines), 30.0)
 
 
 def test_an_emergency_stop_reaches_all_that_listen(tmp_path: Path) -> None:

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 def machine(*bits: int) -> StateMachine:
     result = StateMachine(lambda before, state, reason: None)
-    result.go(State.CONNECTING, "")
-    result.go(State.READY, "")
+    result.enter(State.CONNECTING, "")
+    result.enter(State.READY, "")
     for info in bits:
-        result.observe(info)
+        result.update(info)
     return result
 
 
@@ -46,20 +46,20 @@ def test_one_that_arms_itself_is_ready_until_it_is_told_and_again_once_it_has_la
     m = machine(sm.AUTO_ARM | sm.IS_ARMED)
     on_ground, in_air = sm.AUTO_ARM | sm.IS_ARMED, sm.AUTO_ARM | sm.IS_ARMED | sm.IS_FLYING
     assert m.state is State.READY
-    m.arm(True)
-    m.observe(sm.AUTO_ARM)  # its pre-flight check begins anew every 30 s: it is not armed for a moment
+    m.note_arming(True)
+    m.update(sm.AUTO_ARM)  # its pre-flight check begins anew every 30 s: it is not armed for a moment
     assert m.state is State.ARMED
-    m.observe(in_air)
-    m.land("down")
-    m.observe(in_air)
+    m.update(in_air)
+    m.note_landing("down")
+    m.update(in_air)
     assert m.state is State.LANDING
-    m.observe(on_ground)
-    m.observe(on_ground)
+    m.update(on_ground)
+    m.update(on_ground)
     assert m.state is State.READY
-    m.arm(True)
-    m.observe(on_ground)
-    m.arm(False)
-    m.observe(on_ground)
+    m.note_arming(True)
+    m.update(on_ground)
+    m.note_arming(False)
+    m.update(on_ground)
     assert m.state is State.READY
 
 
@@ -67,29 +67,29 @@ def test_one_that_arms_itself_is_ready_until_it_is_told_and_again_once_it_has_la
 def test_trouble_in_the_air_is_an_emergency_until_reconnected(bit: int) -> None:
     m = machine(sm.IS_ARMED | sm.IS_FLYING, bit)
     assert m.state is State.EMERGENCY
-    m.observe(sm.CAN_BE_ARMED)
+    m.update(sm.CAN_BE_ARMED)
     assert m.state is State.EMERGENCY
-    m.go(State.CONNECTING, "again")
-    m.go(State.READY, "")
+    m.enter(State.CONNECTING, "again")
+    m.enter(State.READY, "")
     assert m.state is State.READY
 
 
 def test_lost_and_heard_again() -> None:
     m = machine(sm.IS_ARMED | sm.IS_FLYING)
-    m.silent("no log")
+    m.note_lost_link("no log")
     assert m.state is State.LOST
-    m.land("lost")
+    m.note_landing("lost")
     assert m.state is State.LOST
-    m.observe(sm.IS_ARMED | sm.IS_FLYING)
+    m.update(sm.IS_ARMED | sm.IS_FLYING)
     assert m.state is State.LANDING
-    m.observe(0)
+    m.update(0)
     assert m.state is State.READY
 
 
 def test_no_way_around_the_table() -> None:
     m = StateMachine(lambda before, state, reason: None)
     with pytest.raises(LocalProtocolError):
-        m.go(State.FLYING, "")
+        m.enter(State.FLYING, "")
 
 
 @settings(deadline=None)
@@ -99,15 +99,15 @@ def test_any_sequence_of_events_keeps_to_the_table(events: list[Any]) -> None:
     stopped = False
     for event in events:
         if isinstance(event, int):
-            m.observe(event)
+            m.update(event)
         elif event == "land":
-            m.land("")
+            m.note_landing("")
         elif event == "takeoff":
-            m.takeoff("")
+            m.note_takeoff("")
         elif event == "silent":
-            m.silent("")
+            m.note_lost_link("")
         else:
-            m.emergency("")
+            m.note_emergency_stop("")
             stopped = True
         if stopped:
             assert m.state in (State.EMERGENCY, State.LOST)

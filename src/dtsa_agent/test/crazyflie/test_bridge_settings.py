@@ -165,7 +165,7 @@ def test_files_of_laboratories_are_taken_as_they_are(robots: list[Any], ids: dic
 
 def test_keys_that_mean_nothing_here_are_named_once() -> None:
     file = laboratory(("cf1", RADIO, {"colour": 1, "battery": {"chemistry": "LiPo"}}), ("cf2", "usb://0", {}))
-    (line,) = [line for line in parse_swarm(file | {"relative": False}).summary() if "not used" in line]
+    (line,) = [line for line in parse_swarm(file | {"relative": False}).describe() if "not used" in line]
     for key in ("relative", "robots.cf1.colour", "robots.cf1.battery.chemistry", "all.broadcasts"):
         assert line.count(key) == 1
     assert line.count("robot_types.cf21.big_quad") == 1  # of both robots
@@ -213,13 +213,13 @@ def test_budget_is_what_one_radio_is_known_to_carry(rate: float, most: int, bits
 def test_budget_counts_each_radio_and_no_udp() -> None:
     wired = [RadioUser("cf9", parse_address("udp://127.0.0.1:19850"), 100, 100)]
     loads = radio_loads(robots(4, 50) + robots(3, 50, "1", channel=100) + wired)
-    assert [(load.where, len(load.robots)) for load in loads] == [("radio 0", 4), ("radio 1", 3)]
+    assert [(load.medium, len(load.robots)) for load in loads] == [("radio 0", 4), ("radio 1", 3)]
     assert all(load.fits for load in loads)
 
 
 def test_two_dongles_on_one_channel_carry_no_more_than_one() -> None:
     loads = radio_loads(robots(4, 50) + robots(4, 50, "1"))
-    assert [(load.where, load.fits) for load in loads] == [
+    assert [(load.medium, load.fits) for load in loads] == [
         ("radio 0", True), ("radio 1", True), ("channel 80 of radios 0, 1", False),
     ]  # fmt: skip
     with pytest.raises(ConfigError, match="channels of their own"):

@@ -17,7 +17,7 @@ import yaml
 from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.positions import MOVED_AGAIN, PoseTracker, PositionSettings, SettlingCheck
+from dtsa_agent.crazyflie.positions import POSES_AFTER_JUMP, PoseTracker, PositionSettings, SettlingCheck
 from dtsa_agent.crazyflie.safety import EstimateWatch
 from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_agent.crazyflie.state import VehicleState
@@ -33,7 +33,7 @@ def tracker(**changes: Any) -> PoseTracker:
 
 
 def offer(t: PoseTracker, place: Any, at: float, *, q: Any = LEVEL, frame: str = "world", flying: bool = False) -> str:
-    return t.offer(place, q, frame, 1000.0 + at, at, flying=flying)
+    return t.receive_pose(place, q, frame, 1000.0 + at, at, flying=flying)
 
 
 @pytest.mark.parametrize(("pose", "kind", "words"), [
@@ -59,20 +59,20 @@ def test_frames_quaternions_and_the_rate() -> None:
     assert offer(t, (0.5, 0.0, -0.95), 1.0, frame="map", q=(0.0, 0.0, 0.0, 0.0)) == ""  # extpos needs no attitude
     assert t.last is not None
     assert (t.last.position, t.last.orientation) == (pytest.approx((0.5, 0.0, 0.0)), None)
-    assert sum(t.due(2.0 + 0.01 * k) for k in range(100)) == pytest.approx(50, abs=1)
+    assert sum(t.is_due(2.0 + 0.01 * k) for k in range(100)) == pytest.approx(50, abs=1)
     full = tracker(max_rate_hz=100)
     assert offer(full, (0.5, 0.0, 0.0), 1.01, q=(0.0, 0.0, 0.0, 1.04)) == ""
     assert full.last is not None
     assert full.last.orientation == (0.0, 0.0, 0.0, 1.0)
     jitter = np.random.default_rng(1).uniform(-0.004, 0.004, 100)
-    assert sum(full.due(2.0 + 0.01 * k + jitter[k]) for k in range(100)) > 90
+    assert sum(full.is_due(2.0 + 0.01 * k + jitter[k]) for k in range(100)) > 90
 
 
 def test_one_that_was_carried_is_believed_again_on_the_ground_only() -> None:
     for flying in (False, True):
         t = tracker()
         offer(t, (0.0, 0.0, 0.0), 1.0)
-        answers = [offer(t, (1.2, 0.0, 0.0), 1.0 + 0.005 * k, flying=flying) for k in range(1, MOVED_AGAIN + 1)]
+        answers = [offer(t, (1.2, 0.0, 0.0), 1.0 + 0.005 * k, flying=flying) for k in range(1, POSES_AFTER_JUMP + 1)]
         assert all(answers[:-1])
         assert (answers[-1] == "") is not flying
     # Two bodies that change names all the time never agree with each other.
@@ -85,7 +85,7 @@ def test_poses_that_come_late_are_not_believed() -> None:
     t = tracker()
 
     def at(stamp: float, arrival: float, *, flying: bool = True) -> str:
-        return t.offer(
+        return t.receive_pose(
             (0.0, 0.0, 1e-4 * arrival), LEVEL, "world", 77000.0 + stamp, arrival, flying=flying
         )  # another clock
 
@@ -97,7 +97,7 @@ def test_poses_that_come_late_are_not_believed() -> None:
     assert at(0.48, 5.484) == ""
     # The clock of motion capture was set back: on the ground its poses are believed again, in flight they are not.
     assert all(at(0.49 + 0.01 * k, 7.0 + 0.01 * k) for k in range(60))
-    answers = [at(1.2 + 0.01 * k, 8.0 + 0.01 * k, flying=False) for k in range(MOVED_AGAIN + 5)]
+    answers = [at(1.2 + 0.01 * k, 8.0 + 0.01 * k, flying=False) for k in range(POSES_AFTER_JUMP + 5)]
     assert answers == [""] * len(answers)  # they have agreed with each other for long
 
 
@@ -107,8 +107,8 @@ def test_latency_and_rate() -> None:
         offer(t, (0.0, 0.0, 0.0), 1.0 + 0.01 * k)
         assert t.last is not None
         t.count_sent(t.last, 1000.0 + 1.0 + 0.01 * k + 0.004)
-    assert t.rate(2.495) == pytest.approx(100, abs=1)
-    assert (t.latency(0.5), t.latency(0.99)) == (pytest.approx(0.004), pytest.approx(0.004))
+    assert t.rate_hz(2.495) == pytest.approx(100, abs=1)
+    assert (t.latency_quantile(0.5), t.latency_quantile(0.99)) == (pytest.approx(0.004), pytest.approx(0.004))
     assert (t.sent, t.age(2.495)) == (150, pytest.approx(0.005))
 
 
@@ -118,7 +118,7 @@ def test_a_pose_that_stands_still_in_flight_is_no_pose() -> None:
     assert offer(t, (0.0, 0.0, 1.0), 1.0, flying=True) == ""
     answers = [offer(t, (0.0, 0.0, 1.0), 1.0 + 0.01 * k, flying=True) for k in range(1, 201)]
     assert all("the same pose again" in answer for answer in answers)
-    assert (t.refused, t.age(3.0), t.place(3.0)) == ({"repeated": 200}, pytest.approx(2.0), None)
+    assert (t.refused, t.age(3.0), t.measured_position(3.0)) == ({"repeated": 200}, pytest.approx(2.0), None)
     assert offer(t, (0.0, 0.0, 1.001), 3.01, flying=True) == ""
     standing = tracker()
     assert [offer(standing, (0.0, 0.0, 0.0), 1.0 + 0.01 * k) for k in range(20)] == [""] * 20
@@ -146,7 +146,7 @@ def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None
 
     for send, size, header in (("extpose", 29, 0x61), ("extpos", 12, 0x60)):
         captured = tracker(send=send)
-        assert captured.offer((1.0, 2.0, 0.5), LEVEL, "world", 0.0, 100.0, flying=False) == ""
+        assert captured.receive_pose((1.0, 2.0, 0.5), LEVEL, "world", 0.0, 100.0, flying=False) == ""
         assert captured.last is not None
         sent: list[Any] = []
         cf = SimpleNamespace(send_packet=sent.append, add_port_callback=lambda *_: None)
@@ -154,10 +154,10 @@ def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None
         data = bytes((sent[0].header,)) + bytes(sent[0].data)
         assert (len(data) - 1, data[0] & 0xF3, captured.sent) == (size, header, 1)
         soon, late = captured.last.time + 0.2, captured.last.time + 1.0
-        assert captured.place(soon) == (1.0, 2.0, 0.5)
-        assert captured.disagrees((1.0, 2.0, 0.45), soon) == ""
-        assert "0.30 m from where it believes to be" in captured.disagrees((1.0, 2.0, 0.8), soon)
-        assert "not seen by motion capture (no pose comes)" in captured.disagrees((1.0, 2.0, 0.5), late)
+        assert captured.measured_position(soon) == (1.0, 2.0, 0.5)
+        assert captured.why_estimate_wrong((1.0, 2.0, 0.45), soon) == ""
+        assert "0.30 m from where it believes to be" in captured.why_estimate_wrong((1.0, 2.0, 0.8), soon)
+        assert "not seen by motion capture (no pose comes)" in captured.why_estimate_wrong((1.0, 2.0, 0.5), late)
 
 
 @pytest.mark.parametrize(("place", "variance", "seen", "words"), [
@@ -171,14 +171,14 @@ def test_settled_is_where_it_stands(place: Any, variance: float, seen: Any, word
     settling = SettlingCheck(0.01, ORIGIN, ROOM, None if seen is None else 0.1)
     settling.restart()
     for _ in range(10):
-        settled = settling.sample(place, (variance,) * 3, None if seen == "not" else seen)
+        settled = settling.add_sample(place, (variance,) * 3, None if seen == "not" else seen)
     assert settled is (words == "")
     assert words in settling.problem
 
 
 def test_an_estimate_that_wanders_has_not_settled() -> None:
     settling = SettlingCheck(0.01, ORIGIN, ROOM, None)
-    assert not any(settling.sample((0.03 * k, 0.0, 0.0), (1e-5,) * 3, None) for k in range(20))
+    assert not any(settling.add_sample((0.03 * k, 0.0, 0.0), (1e-5,) * 3, None) for k in range(20))
     assert "its place moves by" in settling.problem
 
 

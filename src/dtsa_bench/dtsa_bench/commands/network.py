@@ -64,7 +64,7 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
         "[--seal]",
     )
     swarm = parser.add_argument_group("the swarm: what all agents share")
-    swarm.add_argument("--policy", metavar="NAME", help=f"who sends next [{DEFAULT_POLICY}]")
+    swarm.add_argument("--policy", metavar="NAME", help=f"policy: which agent sends next [{DEFAULT_POLICY}]")
     add_options(swarm, SwarmConfig, "swarm", skip=_NO_OPTION)
 
 
@@ -146,7 +146,7 @@ environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
             nargs="?",
             const="0",
             metavar="SECONDS",
-            help="does not fly: tells who is heard, in time, and by whom; exit code 0: all hear all [until all know]",
+            help="no flight: reports which agents hear each other in time; exit code 0: all hear all [until all know]",
         )
         add_network_options(parser)
 

@@ -43,7 +43,7 @@ Other nodes follow it with use_sim_time:=true. Keys: space pauses and goes on, q
             help="wait S seconds before the first message, for subscribers to find the player (default 0.5)",
         )  # fmt: skip
         parser.add_argument(
-            "--wait-for-subscriber", action="store_true", help="begin when somebody subscribes to one of the topics"
+            "--wait-for-subscriber", action="store_true", help="begin when one of the topics has a subscriber"
         )
 
     def run(self, args: argparse.Namespace) -> int:
@@ -182,7 +182,7 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
             from .network import read_network_options
 
             settings, config = read_network_options(args)
-            history = RunHistory(settings.where)
+            history = RunHistory(settings.destination)
             source = NetworkListener(history, config, settings)
         else:
             from dtsa_agent.ros.common import names

@@ -188,23 +188,23 @@ def _fly_sweep(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     from dtsa_bench.experiments.tables import SweepTable, table_text, write_results
     from dtsa_bench.runs.options import processes
 
-    start, code, say = time.monotonic(), code_digest(sweep.batch.plug_ins), (lambda _: None) if args.json else print
+    start, code, report = time.monotonic(), code_digest(sweep.batch.plug_ins), (lambda _: None) if args.json else print
     table = SweepTable(sweep, run_in(directory, sweep.batch, jobs=processes(args.jobs), cluster=args.cluster))
     write_results(directory, table, code)
     flown = time.monotonic() - start
     command = f"{program()} {shlex.join(sys.argv[1:])}"
-    say(table_text(table, shutil.get_terminal_size((0, 0)).columns))
+    report(table_text(table, shutil.get_terminal_size((0, 0)).columns))
     if args.paper:
         from dtsa_bench.experiments.paper import write_paper
 
         files = write_paper(table, directory / "paper", args.paper, code, command)
-        say(f"paper: {directory / 'paper'}: {', '.join(files)}")
+        report(f"paper: {directory / 'paper'}: {', '.join(files)}")
     if not args.no_report:
         from dtsa_bench.pages.report.tables import write_report
 
-        say(f"report: {write_report(table, directory, code, command)}")
+        report(f"report: {write_report(table, directory, code, command)}")
     seconds = f"{flown:.1f} s, {time.monotonic() - start:.1f} s with the report"
-    say(f"{sweep.name}: {len(table.rows)} runs in {seconds}")
+    report(f"{sweep.name}: {len(table.rows)} runs in {seconds}")
     if args.json:
         print((directory / "results.json").read_text(encoding="utf-8"), end="")
     reasons = [row["reason"] for row in table.rows if row["status"] == FAILED]

@@ -45,7 +45,7 @@ AXIS_LABELS = {
 
 def _group(table: SweepTable, labels: Mapping[str, Any]) -> Group | None:
     """The only group with these labels that has rows; None if there is none or more than one."""
-    groups = [group for group in table.where(**labels) if group.rows]
+    groups = [group for group in table.select_groups(**labels) if group.rows]
     return groups[0] if len(groups) == 1 else None
 
 

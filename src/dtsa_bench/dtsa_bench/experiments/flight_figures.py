@@ -23,7 +23,7 @@ TRUE, ESTIMATED, RECEIVED = palette.SERIES[2], INK, palette.SERIES[4]
 def _flights(table: SweepTable, spec: Spec) -> list[tuple[str, SimulatedFlight]]:
     """One flight of the first seed for each level of ``facets``, flown again with a log."""
     facets = table.levels(spec["facets"])
-    groups = [table.where(**{spec["facets"]: facet})[0] for facet in facets]
+    groups = [table.select_groups(**{spec["facets"]: facet})[0] for facet in facets]
     seed = table.sweep.seeds[0]
     return [
         (str(facet), simulate(group.cell.run(seed), log=True, observer=1))

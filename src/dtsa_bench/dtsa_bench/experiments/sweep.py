@@ -10,8 +10,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.core.errors import UNKNOWN, ConfigError
-from dtsa_agent.core.plugins.entry_points import plug_ins_named
+from dtsa_agent.core.errors import SETTING_NAMES, ConfigError
+from dtsa_agent.core.plugins.entry_points import list_plugins
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Setting, Settings, check, setting, settings_of
@@ -115,7 +115,7 @@ class Sweep:
     @cached_property
     def batch(self) -> Batch:
         """The runs, with the plug-ins that they name."""
-        named = {named for cell in self.cells for named in plug_ins_named(cell.run(self.seeds[0]).swarm)}
+        named = {named for cell in self.cells for named in list_plugins(cell.run(self.seeds[0]).swarm)}
         return Batch(self.name, self.tasks, fly, frozenset(named))
 
 
@@ -149,7 +149,7 @@ def run_config(settings: Mapping[str, Any]) -> RunConfig:
     for name, value in settings.items():
         section = section_of(name)
         if section is None:
-            raise ConfigError(name, value, UNKNOWN + ", ".join(setting_specs()))
+            raise ConfigError(name, value, SETTING_NAMES + ", ".join(setting_specs()))
         parts[section][name] = value
     swarm = SwarmConfig.from_dict(parts["swarm"])
     channel = {**from_swarm(swarm), **parts["channel"]}

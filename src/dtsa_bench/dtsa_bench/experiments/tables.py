@@ -180,8 +180,8 @@ class SweepTable:
         """The values of an axis, in the sweep's order."""
         return list(dict.fromkeys(group.labels[axis] for group in self.groups))
 
-    def where(self, **labels: Any) -> list[Group]:
-        """Groups with these labels."""
+    def select_groups(self, **labels: Any) -> list[Group]:
+        """Return the groups with these labels."""
         return [g for g in self.groups if all(g.labels.get(axis) == value for axis, value in labels.items())]
 
     def measured(self, measures: Sequence[str] = tuple(MEASURES)) -> list[str]:

@@ -156,7 +156,7 @@ def fly(
             # Started first: the interpreter of each process needs longer than all that follows here.
             late = _start_agents(children, run, options, directory, stop)
             try:
-                with stop.at_once():
+                with stop.interruptible():
                     if on_domain:
                         on_domain(domain, environment)
                     init_ros(QUIET, context, domain)

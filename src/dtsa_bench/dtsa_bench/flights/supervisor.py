@@ -80,7 +80,7 @@ class RealtimeSupervisor(ChannelObserver):
     def _report_end(self, child: Child) -> None:
         """Takes note that a process has ended.
 
-        :raises NodeError: when nobody is left.
+        :raises NodeError: when no agent is left.
         """
         left = not child.process.returncode
         self._print(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
@@ -90,7 +90,7 @@ class RealtimeSupervisor(ChannelObserver):
             self._dead.append((time.monotonic() + self._respawn_s, child))
             self._measurement.metrics.awaited.update(child.agents)
         if len(self._channel.lost) == self._channel.agents and not self._dead and not self._late:
-            raise NodeError(f"nobody is left: {describe_end(child)}")
+            raise NodeError(f"no agent is left: {describe_end(child)}")
 
     def _restart(self, child: Child) -> None:
         """Starts the program of some agents again; their vehicles have gone on hovering where they were."""

@@ -44,7 +44,7 @@ class ReceivedFrames(NamedTuple):
     sender: NDArray[np.int64]  # ids
     slot: NDArray[np.int64]  # that the sender counted
     time_ns: NDArray[np.int64]  # ns, when, from the start of slot 0
-    by: Mask  # (H, N) by whom
+    receivers: Mask  # (H, N) agents that accepted it
     before: Mask  # (H,) before the slot, by an agent that began with it
     data: list[bytes]
 

@@ -163,7 +163,7 @@ def log_of_flight(flight: SimulatedFlight) -> FlightLog:
         for frame in flight.accepted:
             sender, slot = named_in(frame.data) or (0, 0)
             if 0 < sender <= config.agents and slot <= frame.row and arrays.sent[slot, sender - 1]:
-                received[place[slot, sender - 1]] |= frame.by
+                received[place[slot, sender - 1]] |= frame.receivers
     start = np.broadcast_to(flight.scenario.start, (1, *arrays.position.shape[1:]))
     return FlightLog(
         name="", settings=flight.run.to_dict(), agents=config.agents, slot_ns=config.slot_ns,
@@ -180,5 +180,5 @@ def log_of_flight(flight: SimulatedFlight) -> FlightLog:
 def _received_frames(flight: SimulatedFlight, agents: int) -> ReceivedFrames:
     frames = flight.accepted or []
     row, slot = (np.array([getattr(frame, name) for frame in frames], np.int64) for name in ("row", "slot"))
-    by, none = np.array([frame.by for frame in frames], np.bool_).reshape(len(frames), agents), np.zeros_like(row)
+    by, none = np.array([frame.receivers for frame in frames], np.bool_).reshape(len(frames), agents), np.zeros_like(row)
     return ReceivedFrames(row, none, slot, none, by, none.astype(np.bool_), [frame.data for frame in frames])

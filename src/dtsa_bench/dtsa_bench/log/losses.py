@@ -83,11 +83,11 @@ def observe(run: FlightArrays, path: str | Path, left_out: Counter[str]) -> Outc
         left_out["collided somewhere"] += int(np.count_nonzero(~good))
         partly = good & (frames.received.sum(axis=1) + frames.lost < run.agents - 1)
         clear = _without_unreached(run, outcome, np.flatnonzero(partly))
-        left_out["not known who was in reach"] += int(np.count_nonzero(partly & ~clear))
+        left_out["receivers in reach not known"] += int(np.count_nonzero(partly & ~clear))
         good &= ~partly | clear
     good &= (outcome != UNKNOWN).any(axis=1)
     if not good.any():
-        raise UnusableBag(Path(path), "of no frame is known who received it")
+        raise UnusableBag(Path(path), "of no frame are the receivers known")
     order = np.flatnonzero(good)
     return frames.row[order], frames.sender[order], outcome[order]
 

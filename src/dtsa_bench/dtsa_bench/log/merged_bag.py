@@ -136,7 +136,7 @@ def _record_fields(log: FlightArrays, row: int, frames: Mapping[tuple[int, int],
     return fields | {
         "heard_sender": heard.sender[part], "heard_slot": heard.slot[part],
         "heard_ns": heard.time_ns[part] - log.start_ns[row],
-        "heard_by": np.frombuffer(pack_received(heard.by[part]), np.uint8),
+        "heard_by": np.frombuffer(pack_received(heard.receivers[part]), np.uint8),
         "heard_before": heard.before[part] if heard.before[part].any() else [],
         "heard_length": [len(data) for data in other] if any(other) else [],
         "heard_data": np.frombuffer(b"".join(other), np.uint8),

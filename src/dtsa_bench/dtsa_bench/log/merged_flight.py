@@ -56,7 +56,7 @@ class PairKnowledge:
         if log.heard is None:
             return
         for k in range(log.heard_ends[row], log.heard_ends[row + 1]):
-            for column in np.flatnonzero(log.heard.by[k]).tolist():
+            for column in np.flatnonzero(log.heard.receivers[k]).tolist():
                 pair, slot = (column + 1, int(log.heard.sender[k])), int(log.heard.slot[k])
                 self._heard[pair] = max(slot, self._heard.get(pair, slot))
 
@@ -362,9 +362,9 @@ def _notes(about: Mapping[str, Any], results: Any) -> list[str]:
             notes.append(text.format(", ".join(f"cf{one}" if isinstance(one, int) else str(one) for one in about[key])))
     if len(results):
         notes.append(
-            f"Results are those of slots {results[0]} to {results[-1]}: from when nobody was on probation until "
+            f"Results are those of slots {results[0]} to {results[-1]}: from when no agent was on probation until "
             "the first agent ended. Completion time counts from there."
         )
     else:
-        notes.append("There are no results: at no time had all been heard, with nobody on probation.")
+        notes.append("There are no results: at no time had all agents been heard, and none was on probation.")
     return notes

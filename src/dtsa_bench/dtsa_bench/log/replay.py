@@ -85,7 +85,7 @@ class AgentReplay:
         if heard is None:
             return
         for k in range(log.heard_ends[row], log.heard_ends[row + 1]):
-            by = heard.by[k, self._columns]
+            by = heard.receivers[k, self._columns]
             if heard.before[k] == before and by.any():
                 data = heard.data[k]
                 self.swarm.hear(int(heard.slot[k]), data[: len(data) - self._tag_length], by.view(np.uint8))
@@ -150,8 +150,8 @@ def replay_tables(log: FlightArrays, tables: Swarm, delivery: DeliveryCounts | N
             delivery.add_slot(starts[row + 1] - starts[row], frames.received[starts[row] : starts[row + 1]])
         if log.heard is not None:
             for k in range(log.heard_ends[row], log.heard_ends[row + 1]):
-                if tables.hear(int(log.heard.slot[k]), log.heard.data[k], log.heard.by[k].astype(np.uint8)) and delivery:
-                    delivery.add_accepted(log.heard.by[k])
+                if tables.hear(int(log.heard.slot[k]), log.heard.data[k], log.heard.receivers[k].astype(np.uint8)) and delivery:
+                    delivery.add_accepted(log.heard.receivers[k])
         else:
             for k in range(starts[row], starts[row + 1]):
                 mask = None

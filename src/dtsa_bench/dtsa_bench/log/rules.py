@@ -140,7 +140,7 @@ class GrantLedger:
             self.broken.append(f"slot {slot}: agent {sender} claims others dead in probation, or as it leaves")
         leases = frame.leases
         if leases and slot % self.agents != sender - 1:
-            self.broken.append(f"slot {slot}: agent {sender} gives turns away in somebody else's turn")
+            self.broken.append(f"slot {slot}: agent {sender} gives turns away in another agent's turn")
         for turn, lessee in zip(self._turns_of_leases(slot, frame.c_s, len(leases)), leases, strict=False):
             if not lessee:
                 continue

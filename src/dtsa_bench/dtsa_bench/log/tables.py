@@ -36,7 +36,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("time_s", "s", "start of the slot, counted from the start of slot 0"),
         ("outcome", "", "the channel's verdict: idle, success, collision (merged: two or more sent); empty: not known"),
         ("senders", "1", "agents that sent; empty: not known"),
-        ("sender", "", "id of the first of them; 0: nobody; empty: not known"),
+        ("sender", "", "id of the first of them; 0: none; empty: not known"),
     ],
     "frames": [
         ("slot", "1", "slot in which the frame was sent"),
@@ -62,7 +62,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("slot", "1", "slot that was decided about"),
         ("time_s", "s", "start of that slot"),
         ("agent", "", "id of the agent that decided"),
-        ("chosen", "", "id of the agent that it takes for the sender; 0: nobody"),
+        ("chosen", "", "id of the agent that it expects to send; 0: none"),
         ("reason", "", "why, by name; see below"),
         ("score", "1", "priority value g of the chosen agent, 0 where the policy has none"),
         ("digest", "", "digest of the agent's table: equal digests, equal tables"),

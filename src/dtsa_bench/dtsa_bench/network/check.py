@@ -26,11 +26,11 @@ _FEWEST = 5  # frames expected, of which a share says something
 def lasts_s(config: SwarmConfig) -> float:
     """How long a check takes, s: until agents that begin cold have settled, and some rounds in which frames count."""
     begun = 3 * config.turn_every * config.agents  # at the latest, where nothing is lost
-    return max(_LEAST_S, (begun + _settled_after(config) + _ROUNDS * config.agents) * config.slot_s)
+    return max(_LEAST_S, (begun + _probation_slots(config) + _ROUNDS * config.agents) * config.slot_s)
 
 
-def _settled_after(config: SwarmConfig) -> int:
-    """Slots after which an agent knows whom to expect: its probation is over."""
+def _probation_slots(config: SwarmConfig) -> int:
+    """Return the number of slots after which an agent knows the owner of each slot: its probation is over."""
     return (2 * config.main_every if config.policy_row.probation else 1) * config.agents
 
 
@@ -68,7 +68,7 @@ class Check:
         self._refused: Counter[str] = Counter()
         self._last = -1
         self._slots = 0  # since it began or restarted
-        self._settled = _settled_after(config)
+        self._settled = _probation_slots(config)
         self._expects = False  # whether the policy expects senders at all
 
     def slot(self, record: SlotRecord) -> None:

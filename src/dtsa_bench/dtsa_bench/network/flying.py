@@ -105,7 +105,7 @@ def brief(summary: Mapping[str, Any]) -> str:
         "hovered": f"without a quorum {early} slots before it flew, {later} after",
         "sent": f"{summary['sent']} frames" + (f", at most {late:.2f} ms late (99 %)" if late is not None else ""),
         "not sent": reasons(summary["unsent_because"]),
-        "heard": f"{summary['heard']} frames of {', '.join(f'cf{agent}' for agent in summary['heard_of']) or 'nobody'}"
+        "heard": f"{summary['heard']} frames of {', '.join(f'cf{k}' for k in summary['heard_of']) or 'no agent'}"
         + (f"; {share:.0%} of the others lately" if share is not None else ""),
         "longest gap": f"{summary['oldest_heard_slots']} slots, of cf{summary['oldest_heard_of']}"
         if summary["oldest_heard_of"]

@@ -51,11 +51,11 @@ class DeliveryCounts:
         if self._agents < 2 or self.slots < _ROUNDS * self._agents or 2 * self.accepted >= self.delivered > 0:
             return ""
         if not self.sent:
-            return f"nobody heard anybody: no frame was sent in {self.slots} slots"
+            return f"no agent heard another: no frame was sent in {self.slots} slots"
         if not self.delivered:
-            return f"nobody heard anybody: {self.sent} frames were sent, and none arrived"
+            return f"no agent heard another: {self.sent} frames were sent, and none arrived"
         kept_out = f"of {self.delivered} frames that arrived {self.delivered - self.accepted} were not taken in"
-        start = "most frames were of no use" if self.accepted else "nobody heard anybody"
+        start = "most frames were of no use" if self.accepted else "no agent heard another"
         counts = not_taken_in or {}
         known = [(counts.get(name, counts.get(f"frame {name}", 0)), why) for name, why in _WHY.items()]
         text = ", ".join(f"{count} {why}" for count, why in known if count)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm
 from dtsa_agent.core.kernel import ffi, lib, memory
-from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
+from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
@@ -67,7 +67,7 @@ def may_share(run: RunConfig) -> bool:
         or air.schedule
         or air.airtime.total_ns(air.airtime.longest) > air.slot_ns
     )
-    return lossless and shareable(swarm)
+    return lossless and can_share_table(swarm)
 
 
 class FlightMetrics:

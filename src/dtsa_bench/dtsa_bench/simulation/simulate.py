@@ -35,7 +35,7 @@ class AcceptedFrame(NamedTuple):
     row: int  # slot in which they did
     slot: int  # of the state in it
     data: bytes
-    by: NDArray[np.bool_]  # (N,) by whom
+    receivers: NDArray[np.bool_]  # (N,) agents that accepted it
 
 
 @dataclass(frozen=True, slots=True)

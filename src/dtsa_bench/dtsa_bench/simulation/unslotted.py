@@ -175,7 +175,7 @@ class UnslottedTraffic:
             self._began.add(index)
         return self._frames[index]
 
-    def take_in(self, index: int, frame: bytes, slot: int) -> None:
+    def receive_frame(self, index: int, frame: bytes, slot: int) -> None:
         """An agent hears a frame that its policy has put together from packets.
 
         :param index: its position in ``ids``.
@@ -184,7 +184,7 @@ class UnslottedTraffic:
         """
         if not isinstance(frame, bytes) or not frame:
             policy = self._swarm.policies[index].name
-            raise PluginError(f"{policy}, wake", f"took in {frame!r}; allowed: bytes of a frame")
+            raise PluginError(f"{policy}, wake", f"received {frame!r}; allowed: bytes of a frame")
         mask = np.zeros(len(self._frames), np.bool_)
         mask[index] = True
         self._carried.combined.append((slot, frame, mask))
@@ -252,14 +252,14 @@ class _Radio:
     def send(self, note: bytes = b"", to: int = 0) -> bool:
         return self._traffic.send(self._index, self._now_ns, note, to)
 
-    def say(self, note: bytes) -> bool:
+    def send_note(self, note: bytes) -> bool:
         return self._traffic.transmit(_Packet(self._index + 1, b"", note), self._now_ns)
 
     def frame(self) -> bytes:
         return self._traffic.frame(self._index)
 
-    def take_in(self, frame: bytes, slot: int) -> None:
-        self._traffic.take_in(self._index, frame, slot)
+    def receive_frame(self, frame: bytes, slot: int) -> None:
+        self._traffic.receive_frame(self._index, frame, slot)
 
 
 def _next_wake(policy: Guarded, answer: object, now_ns: int, method: str = "wake") -> int:

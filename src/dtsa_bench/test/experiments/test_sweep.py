@@ -174,7 +174,7 @@ def test_failures_are_rows_with_a_reason_and_are_tried_again(tmp_path: Path, mon
 
     monkeypatch.setattr(simulate, "simulate", sometimes)
     plan = sweep()
-    group = fly(tmp_path, plan).where(policy="dtsa", channel="clear")[0]
+    group = fly(tmp_path, plan).select_groups(policy="dtsa", channel="clear")[0]
     assert (len(group.rows), group.flown_count, group.failed, group.crashed.total) == (6, 3, 3, 3)
     assert group.left_out["failed (RuntimeError: out of luck)"] == 3
     monkeypatch.setattr(simulate, "simulate", real)
@@ -186,11 +186,11 @@ def test_crashes_and_timeouts_are_left_out_of_means_and_counted(tmp_path: Path) 
         "agents": [8, 14], "timeout_s": [0.5, 20.0],
     })  # fmt: skip
     table = fly(tmp_path, plan)
-    late = table.where(agents=8, timeout_s=0.5)[0]
+    late = table.select_groups(agents=8, timeout_s=0.5)[0]
     assert late.left_out == {"timed out": 12}
     assert late.mean("min_distance_m").count == 0
     assert late.mean("age_mean_slots").count == 12
-    risky = table.where(agents=14, timeout_s=20.0)[0]
+    risky = table.select_groups(agents=14, timeout_s=20.0)[0]
     crashed = sum(row["collided"] for row in risky.rows)
     assert crashed > 0
     assert risky.left_out.get("crashed", 0) == crashed == risky.crashed.count

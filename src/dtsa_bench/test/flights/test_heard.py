@@ -53,10 +53,10 @@ class Initials:
     def estimate(self, table, slot, step, position, velocity):
         position[:], velocity[:] = table.sent_position, table.sent_velocity
 
-    def say(self, table, slot):
+    def own_data(self, table, slot):
         return bytes([65 + table.agent, 97 + slot % 26])
 
-    def heard(self, table, slot, sender, data):
+    def receive_data(self, table, slot, sender, data):
         assert data == bytes([65 + sender, 97 + slot % 26]), (slot, sender, data)
 '''
 # Options, and the bytes that policy and estimator append to a frame.
@@ -165,7 +165,7 @@ def test_an_agent_of_another_key_on_a_network_hears_nobody_and_says_so(tmp_path:
         assert summary["not_taken_in"]["rejected"] > 0
     code, said, summary = other
     assert code == 1
-    at_the_end = r"dtsa: cf4: nobody heard anybody: .* [1-9]\d* rejected \(no tag, or one of another key"
+    at_the_end = r"dtsa: cf4: no agent heard another: .* [1-9]\d* rejected \(no tag, or one of another key"
     assert re.match(f"({in_flight})*{at_the_end}", said), said
     assert summary["heard_of"] == []
     merged = bench("merge", str(tmp_path / "cf1"), str(tmp_path / "cf4"))  # two frames in six were taken in
@@ -227,7 +227,7 @@ def on_a_network(folder: Path, words: tuple[str, ...], keys: list[str]) -> Itera
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 @pytest.mark.parametrize(
     ("keys", "says"),
-    [([KEY, KEY, OTHER_KEY], "most frames were of no use"), ([KEY, OTHER_KEY, THIRD_KEY], "nobody heard anybody")],
+    [([KEY, KEY, OTHER_KEY], "most frames were of no use"), ([KEY, OTHER_KEY, THIRD_KEY], "no agent heard another")],
 )
 def test_agents_of_other_keys_are_refused_and_the_flight_says_so(tmp_path, mode, keys, says):
     out = tmp_path / "out"
@@ -260,7 +260,7 @@ def test_a_flight_in_which_nobody_heard_anybody_has_failed(tmp_path: Path, mode:
     words = ["--agents", "3", "--mode", mode, "--slot-ms", "20", "--policy", "tdma", "--loss", "1", "--timeout-s", "2"]
     done = bench("fly", *words, "--no-picture", "--out", str(out))
     assert done.returncode == 1
-    said = r"nobody heard anybody: \d+ frames were sent, and none arrived"
+    said = r"no agent heard another: \d+ frames were sent, and none arrived"
     assert re.fullmatch(f"dtsa: {said}", done.stderr.strip().splitlines()[-1])
     checked = bench("verify", str(out))
     assert checked.returncode == 0  # the protocol was kept

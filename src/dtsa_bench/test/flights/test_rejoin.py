@@ -196,10 +196,10 @@ def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) 
     few = ("--agents", "2", "--moving", "2", "--processes", "1", "--mode", "realtime", "--policy", "lease")
     with start_flight(tmp_path / "over", *few, "--no-picture") as flight:
         os.kill(flight.nodes[0], signal.SIGKILL)
-        flight.assert_ends(1, "nobody is left: swarm_host_1 with cf1 .. cf2")
+        flight.assert_ends(1, "no agent is left: swarm_host_1 with cf1 .. cf2")
         flight.assert_verifies()
     summary = summary_of(flight.out)
-    assert "nobody is left" in summary["cut_short"]
+    assert "no agent is left" in summary["cut_short"]
     assert summary["lost_agents"] == [1, 2]
     with start_flight(tmp_path / "again", *few, "--no-picture", "--respawn", "0") as flight:
         os.kill(flight.nodes[0], signal.SIGKILL)

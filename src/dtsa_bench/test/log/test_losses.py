@@ -141,7 +141,7 @@ def test_what_is_out_of_reach_or_collides_is_no_loss(tmp_path):
     run, left_out = load_log(flight), Counter()
     _, _, outcome = observe(run, flight, left_out)
     assert left_out["collided somewhere"] == np.count_nonzero(run.sent_frames.collided)
-    assert not left_out["not known who was in reach"]
+    assert not left_out["receivers in reach not known"]
     alone = run.sent_frames.collided == 0
     assert np.count_nonzero(outcome == LOST) == run.sent_frames.lost[alone].sum()
     assert np.count_nonzero(outcome == HEARD) == run.sent_frames.received[alone].sum()

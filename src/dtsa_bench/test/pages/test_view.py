@@ -237,5 +237,5 @@ def test_a_page_is_told_once_that_nobody_hears_anybody(tmp_path: Path) -> None:
         history = history_of(tmp_path / name)
         moments = [json.loads(moment.text) for moment in history.since(0, MAX_MOMENTS)[1]]
         texts = [event[2] for moment in moments for event in moment["events"]]
-        found = [text for text in texts if text.startswith("nobody heard anybody: ")]
+        found = [text for text in texts if text.startswith("no agent heard another: ")]
         assert len(found) == told, texts

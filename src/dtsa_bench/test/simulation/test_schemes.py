@@ -183,7 +183,7 @@ def test_a_first_report_of_sotdma_keeps_out_of_slots_that_others_have_announced_
     sent = -1
     for slot in range(12, 36):
         if slot not in free:
-            agent.heard(table, slot - 1, 2, bytes((0, 1, 0)))
+            agent.receive_data(table, slot - 1, 2, bytes((0, 1, 0)))
         if sent < 0 and agent.choose(table, slot) == 1:
             sent = slot
     assert sent in free
@@ -199,7 +199,7 @@ def test_an_agent_of_sotdma_that_finds_no_free_slot_may_take_that_of_the_agent_f
         swarm.sent_position[0][:, owner - 1] = (away_m, 0.0, 0.0)
     for owner, slot in ((1, 21), (2, 22), (3, 23)):
         if slot != free:
-            agent.heard(table, 11, owner, bytes((0, slot - 11, 0)))
+            agent.receive_data(table, 11, owner, bytes((0, slot - 11, 0)))
     sent = [slot for slot in range(12, 24) if agent.choose(table, slot) == 5]
     assert sent == [taken]
 

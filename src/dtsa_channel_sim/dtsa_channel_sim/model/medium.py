@@ -1,7 +1,7 @@
 """The medium: what transmissions do to each other at each receiver, at any instant.
 
 This is the one place that says how long a frame is on air, who is in reach, what overlap does, when the stronger of two
-frames survives, that who sends does not hear, when a radio finds the air busy, and what noise takes away.
+frames survives, that a sender does not hear, when a radio finds the air busy, and what noise takes away.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ class Change:
             entry = entry.to_dict()
         if not isinstance(entry, Mapping):
             raise ConfigError(name, entry, "{slot: or at_s:, until:, and what changes: " + _changeable(config) + "}")
-        slot = _when(entry, "slot", "at_s", config.slot_ns, name)
-        until = _when(entry, "until", "until_s", config.slot_ns, name)
+        slot = _read_slot(entry, "slot", "at_s", config.slot_ns, name)
+        until = _read_slot(entry, "until", "until_s", config.slot_ns, name)
         if slot is None:
             raise ConfigError(f"{name}.slot", None, "a slot (slot: 100) or seconds (at_s: 1.0)")
         if until is not None and until <= slot:
@@ -78,7 +78,7 @@ def _normal(config: Config, name: str, value: object, entry: str) -> tuple[str, 
     return name, spec.check(value, f"{entry}.{name}")
 
 
-def _when(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: int, name: str) -> int | None:
+def _read_slot(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: int, name: str) -> int | None:
     if slot_key in entry and time_key in entry:
         raise ConfigError(f"{name}.{time_key}", entry[time_key], f"either {slot_key} or {time_key}, not both")
     if entry.get(slot_key) is not None:

@@ -40,7 +40,9 @@ _MAX_BACKOFFS, _MIN_EXPONENT, _MAX_EXPONENT = 4, 3, 5  # CSMA/CA without slots o
 class AccessSettings(Settings):
     """How agents share the medium."""
 
-    access: str = setting("unlimited", "who sends when; unlimited: messages do not disturb each other", choices=ACCESS)
+    access: str = setting(
+        "unlimited", "which node sends when; unlimited: messages do not disturb each other", choices=ACCESS
+    )
     slot_ms: float = setting(10.0, "length of a slot", unit="ms", minimum=0.3, maximum=1000.0)
     queue: int = setting(4, "messages of a topic that wait; newer ones replace the oldest", minimum=1, maximum=1000)
     longest: int = setting(4096, "longest message", unit="bytes", minimum=1, maximum=1 << 20)

@@ -1,13 +1,13 @@
 """Policies, estimators and avoiders from other packages, found by entry point. See docs/reference/plug-ins.md.
 
-A package announces them in its metadata::
+A package declares them in its metadata::
 
     [project.entry-points."dtsa.policies"]
     reverse = "my_package:Reverse"
 
-and then ``policy="reverse"`` works everywhere: in `simulate`, `sweep` and in the nodes. What is announced is
-a factory; it is called once for every observer, as ``factory(config, agent)`` (agent: its id, 0 for tables
-that hear everything). What it makes is one of :mod:`.kinds`.
+and then ``policy="reverse"`` works everywhere: in `simulate`, `sweep` and in the nodes. The entry point is a factory,
+called once for every observer as ``factory(config, agent)`` (agent: its id, 0 for tables that hear everything). It
+returns an object with one of the interfaces of :mod:`.kinds`.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ _REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
 
 def uses_plugins(config: SwarmConfig) -> bool:
     """Whether a configuration names anything that is not built in."""
-    return bool(plug_ins_named(config))
+    return bool(list_plugins(config))
 
 
-def plug_ins_named(config: SwarmConfig) -> list[tuple[str, str]]:
-    """Kind and name of each part that a configuration names and that is not built in."""
-    named = ((registry, str(getattr(config, registry.kind))) for registry in _REGISTRIES)
-    return [(registry.kind, name) for registry, name in named if name not in registry.rows]
+def list_plugins(config: SwarmConfig) -> list[tuple[str, str]]:
+    """Return kind and name of each plug-in in a configuration."""
+    parts = ((registry, str(getattr(config, registry.kind))) for registry in _REGISTRIES)
+    return [(registry.kind, name) for registry, name in parts if name not in registry.rows]
 
 
-def shareable(config: SwarmConfig) -> bool:
-    """Whether agents of such a swarm may share one table for as long as all hear the same."""
+def can_share_table(config: SwarmConfig) -> bool:
+    """Whether the agents of one process may share a table for as long as all of them receive the same frames."""
     return config.policy_row.may_share and not uses_plugins(config)
 
 
@@ -56,9 +56,9 @@ def make_swarm(
     shared_table: bool = False,
     observers: Sequence[int] | None = None,
 ) -> Swarm:
-    """A :class:`Swarm`, a :class:`PluginSwarm` if the configuration names plug-ins; parameters are those of ``Swarm``.
+    """Create a :class:`Swarm`, or a :class:`PluginSwarm` if the configuration names plug-ins.
 
-    With plug-ins every agent has a table of its own.
+    Parameters are those of ``Swarm``; with plug-ins every agent has its own table.
 
     :raises ConfigError: for ids and plug-ins that do not exist.
     """
@@ -68,9 +68,9 @@ def make_swarm(
 
 
 class PluginSwarm(Swarm):
-    """A swarm some of whose parts are Python objects from other packages. Every observer has its own instances.
+    """A swarm with plug-ins. Every observer has its own instances; the kernel runs the built-in parts.
 
-    Its kernel leaves to this class what is not built in; parameters are those of :class:`Swarm`.
+    Parameters are those of :class:`Swarm`.
     """
 
     all_in_c = False
@@ -78,49 +78,49 @@ class PluginSwarm(Swarm):
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
         self._ids = [int(index) + 1 for index in self.observer]
-        self.tables = [Table(self, row) for row in range(len(self._ids))]  # what each observer knows
-        self._outcome = np.zeros(len(self._ids), dtype=np.uint8)  # SlotOutcome of the present slot, collisions apart
-        self._appended: dict[int, bytes] = {}  # in this slot, by position in ids
+        self.tables = [Table(self, row) for row in range(len(self._ids))]  # of each observer
+        self._outcome = np.zeros(len(self._ids), dtype=np.uint8)  # SlotOutcome of this slot, without collisions
+        self._appended: dict[int, bytes] = {}  # own data of this slot's frames, by position in ids
         self._own_bytes = self.config.own_bytes
         self._make_parts()
 
     def _make_parts(self) -> None:
-        everybody = self.config.policy_row.needs_everybody and bool(self.ids)
-        self._genie = self._guarded(POLICIES, 0) if everybody else None
-        #: The parts of each observer; empty if they are built in, or one policy looks into all agents.
-        self.policies, self.estimators, self.avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
-        self._list_speakers()
+        has_genie = self.config.policy_row.needs_everybody and bool(self.ids)
+        self._genie = self._make_part(POLICIES, 0) if has_genie else None
+        #: Plug-ins of each observer; empty if the part is built in, or the policy is a genie.
+        self.policies, self.estimators, self.avoiders = (self._make_instances(r, self._ids) for r in _REGISTRIES)
+        self._list_data_parts()
 
-    def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Guarded]:
+    def _make_instances(self, registry: Registry[Any], ids: list[int]) -> list[Guarded]:
         name = getattr(self.config, registry.kind)
         if name in registry.rows or getattr(registry.row(name), "needs_everybody", False):
             return []
-        return [self._guarded(registry, agent) for agent in ids]
+        return [self._make_part(registry, agent) for agent in ids]
 
-    def _guarded(self, registry: Registry[Any], agent: int) -> Guarded:
+    def _make_part(self, registry: Registry[Any], agent: int) -> Guarded:
         name = getattr(self.config, registry.kind)
         return Guarded(registry.kind, name, registry.factory(name), self.config, agent)
 
-    def _list_speakers(self) -> None:
-        """Note the parts of each observer that may say something, with the size of it, in the frame's order."""
+    def _list_data_parts(self) -> None:
+        """List the policy and the estimator of each observer with the size of their data, in the frame's order."""
         policy, estimator = self.config.policy_row, self.config.estimator_row
         parts = ((self.policies, policy.own_bytes), (self.estimators, estimator.own_bytes))
-        self._speakers = [
+        self._data_parts = [
             [(instances[row], size) for instances, size in parts if instances] for row in range(len(self._ids))
         ]
-        self._listen_to_outcome = any(hasattr(part, "slot_over") for row in self._speakers for part, _ in row)
+        self._needs_outcome = any(hasattr(part, "slot_over") for row in self._data_parts for part, _ in row)
 
     def decide(self, slot: int) -> None:
         if self._genie is not None:
-            senders = self._genie.sending(self._genie.senders(self, slot), slot, self.config.agents)
+            senders = self._genie.check_senders(self._genie.senders(self, slot), slot, self.config.agents)
             self.chosen[:], self.sends[:] = senders[0] if senders else 0, 0
             for agent in senders:
                 self.sends[agent - 1] = self.present[agent - 1] > 0
         elif self.policies:
-            self.estimate(slot)  # the control instants and the metrics leave others, which depend on what flies it
+            self.estimate(slot)  # for the slot's start; those of control instants and metrics depend on the vehicle
             for index, agent in enumerate(self.ids):
                 policy = self.policies[index]
-                chosen = policy.chosen(policy.choose(self.tables[index], slot), slot, self.config.agents)
+                chosen = policy.check_choice(policy.choose(self.tables[index], slot), slot, self.config.agents)
                 self.chosen[index], self.sends[index] = chosen, chosen == agent and self.present[index]
         else:
             super().decide(slot)
@@ -139,9 +139,9 @@ class PluginSwarm(Swarm):
         return senders
 
     def _own_data(self, index: int, slot: int) -> Iterator[bytes]:
-        for part, size in self._speakers[index]:
+        for part, size in self._data_parts[index]:
             if size:
-                yield part.checked_bytes(part.say(self.tables[index], slot), size)
+                yield part.check_own_data(part.own_data(self.tables[index], slot), size)
 
     def frame(self, local_index: int) -> bytes:
         data = self._encoded(local_index)
@@ -151,18 +151,18 @@ class PluginSwarm(Swarm):
         end = max(0, len(frame) - self._own_bytes)
         if not super()._receive(slot, frame[:end], mask):
             return False
-        if not (self._own_bytes or self._listen_to_outcome):
+        if not (self._own_bytes or self._needs_outcome):
             return True
         sender = decode_frame(frame[:end]).sender
         for row, agent in enumerate(self._ids):
             if agent == sender or (mask is not None and not mask[row]):
                 continue
             self._outcome[row] = SlotOutcome.FRAME
-            at = end
-            for part, size in self._speakers[row]:
+            offset = end
+            for part, size in self._data_parts[row]:
                 if size:
-                    part.heard(self.tables[row], slot, sender, frame[at : at + size])
-                at += size
+                    part.receive_data(self.tables[row], slot, sender, frame[offset : offset + size])
+                offset += size
         return True
 
     def estimate(self, slot: int, step: int = 0) -> None:
@@ -173,14 +173,14 @@ class PluginSwarm(Swarm):
             self.estimators, self.tables, self.estimate_position, self.estimate_velocity, strict=True
         ):
             estimator.estimate(table, slot, step, position, velocity)
-            estimator.estimated(position, velocity, slot=slot)
+            estimator.check_estimates(position, velocity, slot=slot)
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
         super().end(slot, collided)
-        if self._listen_to_outcome:
+        if self._needs_outcome:
             self._report_outcome(slot, collided)
         if self.estimators:
-            self.estimate(slot + 1)  # what the metrics compare with the truth
+            self.estimate(slot + 1)  # for the metrics
 
     def _report_outcome(self, slot: int, collided: Bytes | None) -> None:
         self._outcome[np.flatnonzero(self.sends & (self.frame_length > 0))] = SlotOutcome.FRAME
@@ -188,7 +188,7 @@ class PluginSwarm(Swarm):
             outcome = SlotOutcome(int(self._outcome[row]))
             if collided is not None and collided[row] and outcome == SlotOutcome.SILENCE:
                 outcome = SlotOutcome.COLLISION
-            for part, _ in self._speakers[row]:
+            for part, _ in self._data_parts[row]:
                 if hasattr(part, "slot_over"):
                     part.slot_over(table, slot, outcome)
         self._outcome[:] = SlotOutcome.SILENCE
@@ -201,8 +201,8 @@ class PluginSwarm(Swarm):
     def restart(self, local_index: int) -> None:
         super().restart(local_index)
         for registry, parts in zip(_REGISTRIES, (self.policies, self.estimators, self.avoiders), strict=True):
-            parts[local_index : local_index + 1] = self._instances(registry, [self.ids[local_index]])
-        self._list_speakers()
+            parts[local_index : local_index + 1] = self._make_instances(registry, [self.ids[local_index]])
+        self._list_data_parts()
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         if estimate and self.estimators:
@@ -210,7 +210,7 @@ class PluginSwarm(Swarm):
         super().steer(slot, step, estimate and not self.estimators)
         for index, avoider in enumerate(self.avoiders[: len(self.ids)]):
             if self.active[index] and self.present[index]:
-                self.command[:, index] = avoider.commanded(avoider.command(self.tables[index], slot, step), slot)
+                self.command[:, index] = avoider.check_command(avoider.command(self.tables[index], slot, step), slot)
 
     def fly(self, slot: int) -> None:
         if not (self.estimators or self.avoiders):
@@ -221,7 +221,7 @@ class PluginSwarm(Swarm):
             self.move(step)
 
     def with_own_tables(self, slot: int) -> Swarm:
-        """Not for these.
+        """Not supported.
 
         :raises ValueError: always: agents have tables of their own already.
         """

@@ -1,4 +1,4 @@
-"""Between the core and parts from other packages: what they raise or answer wrongly is named as theirs."""
+"""Calls of plug-ins: an error that a plug-in raises, or a wrong return value, becomes a PluginError with its name."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import DtsaError, PluginError, shown
 
 # The method that a plug-in must have, by its kind; policies for comparison have another one instead.
-_NEEDED = {
+_REQUIRED = {
     "policy": "choose(table, slot)",
     "estimator": "estimate(table, slot, step, position, velocity)",
     "avoider": "command(table, slot, step)",
 }
 _FOR_COMPARISON = ("senders(swarm, slot)", "wake(table, now_ns, radio)")
-_SPEAKS = ["say(table, slot)", "heard(table, slot, sender, data)"]  # with bytes of its own in frames
+_OWN_DATA = ["own_data(table, slot)", "receive_data(table, slot, sender, data)"]  # with `own_bytes`
 
 
 class Guarded:
-    """One instance of a plug-in, of a kind as in ``_NEEDED``, with the methods that the instance has.
+    """One instance of a plug-in, of a kind as in ``_REQUIRED``, with the instance's methods.
 
-    :raises PluginError: in place of errors of its factory and its methods, and if it lacks the method of its kind; a
-        ConfigError, of options for instance, stays one. So do those below that check an answer, if it is none.
+    :raises PluginError: if the factory or a method raises an error, lacks the method of its kind, or returns a value
+        that is not allowed. A ConfigError (of options, for instance) stays one.
     """
 
     def __init__(self, kind: str, name: str, factory: Callable[..., Any], *arguments: object) -> None:
         self.name = f"{kind} {name}"
         self.instance = _guarded(self.name, factory)(*arguments)
-        needed = [_NEEDED[kind]]
+        required = [_REQUIRED[kind]]
         if kind == "policy":
-            needed = [next((text for text in _FOR_COMPARISON if _has(factory, text)), needed[0])]
+            required = [next((text for text in _FOR_COMPARISON if _has(factory, text)), required[0])]
         if kind != "avoider" and getattr(factory, "own_bytes", None):
-            needed += _SPEAKS
-        missing = [text for text in needed if not _has(self.instance, text)]
+            required += _OWN_DATA
+        missing = [text for text in required if not _has(self.instance, text)]
         if missing:
             raise PluginError(self.name, f"{type(self.instance).__name__} has no method {' and '.join(missing)}")
 
@@ -47,20 +47,20 @@ class Guarded:
         setattr(self, method, call)
         return call
 
-    def chosen(self, answer: object, slot: int, agents: int) -> int:
-        """What ``choose`` has answered, as an id; 0: nobody."""
-        return self._whole(answer, "choose", slot, 0, agents, "0 (nobody)")
+    def check_choice(self, answer: object, slot: int, agents: int) -> int:
+        """Check the return value of ``choose``: an id, or 0 for no agent."""
+        return self._check_id(answer, "choose", slot, 0, agents, "0 (no agent)")
 
-    def sending(self, answer: Any, slot: int, agents: int) -> list[int]:
-        """What ``senders`` has answered, as ids."""
+    def check_senders(self, answer: Any, slot: int, agents: int) -> list[int]:
+        """Check the return value of ``senders``: ids."""
         try:
-            named = list(answer)
+            ids = list(answer)
         except Exception:
             fault = f"gave {shown(answer)} in slot {slot}; allowed: a list of the ids that send"
             raise PluginError(f"{self.name}, senders", fault) from None
-        return [self._whole(agent, "senders", slot, 1, agents, "1") for agent in named]
+        return [self._check_id(agent, "senders", slot, 1, agents, "1") for agent in ids]
 
-    def _whole(self, answer: object, method: str, slot: int, low: int, high: int, least: str) -> int:
+    def _check_id(self, answer: object, method: str, slot: int, low: int, high: int, least: str) -> int:
         try:
             number = operator.index(answer)  # type: ignore[arg-type]
         except Exception:  # whatever its __index__ raises
@@ -70,15 +70,15 @@ class Guarded:
             raise PluginError(f"{self.name}, {method}", fault)
         return number
 
-    def checked_bytes(self, answer: object, size: int) -> bytes:
-        """What ``say`` has answered: as many bytes as it has declared."""
+    def check_own_data(self, answer: object, size: int) -> bytes:
+        """Check the return value of ``own_data``: as many bytes as ``own_bytes`` declares."""
         if not isinstance(answer, (bytes, bytearray)) or len(answer) != size:
             size_text = f"{len(answer)} bytes" if isinstance(answer, (bytes, bytearray)) else shown(answer)
-            raise PluginError(f"{self.name}, say", f"gave {size_text}, declared {size}")
+            raise PluginError(f"{self.name}, own_data", f"gave {size_text}, declared {size}")
         return bytes(answer)
 
-    def commanded(self, answer: Any, slot: int) -> tuple[float, ...]:
-        """What ``command`` has answered, m/s: three finite numbers."""
+    def check_command(self, answer: Any, slot: int) -> tuple[float, ...]:
+        """Check the return value of ``command``: three finite numbers, m/s."""
         try:
             velocity = tuple(float(value) for value in answer)
         except Exception:
@@ -88,8 +88,8 @@ class Guarded:
             raise PluginError(f"{self.name}, command", fault)
         return velocity
 
-    def estimated(self, *arrays: NDArray[np.float64], slot: int) -> None:
-        """Check that what ``estimate`` has written is finite."""
+    def check_estimates(self, *arrays: NDArray[np.float64], slot: int) -> None:
+        """Check that ``estimate`` has written finite numbers."""
         if not all(np.isfinite(array).all() for array in arrays):
             raise PluginError(f"{self.name}, estimate", f"wrote a number that is not finite in slot {slot}")
 
@@ -105,6 +105,6 @@ def _guarded(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         except DtsaError:
             raise
         except (Exception, SystemExit, GeneratorExit) as error:  # a plug-in does not end the program
-            raise PluginError.raised(part, error) from error
+            raise PluginError.from_exception(part, error) from error
 
     return call

@@ -1,6 +1,6 @@
-"""The kinds of plug-ins: what policies, estimators and avoiders from other packages have, and what they are given.
+"""Interfaces of plug-ins: policies, estimators and avoiders from other packages, and the objects passed to them.
 
-``table`` is what the observer knows, ``slot`` the number of a slot, ``now_ns`` ns since the start of slot 0. Ids count
+``table`` is the observer's table, ``slot`` the number of a slot, ``now_ns`` ns since the start of slot 0. Ids count
 from 1; positions are m, velocities m/s, frame map.
 """
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class Table:
-    """What one observer knows; arrays are read-only windows on its table and are always up to date.
+    """Table of one observer; arrays are read-only views, always up to date.
 
     Positions are m, velocities m/s, frame map, with shape (3, N); agent ``id`` is column ``id - 1``.
     """
@@ -37,10 +37,10 @@ class Table:
         self.in_ap = _window(swarm.in_ap[row])  # (N,) A_p
         self.estimate_position = _window(swarm.estimate_position[row])  # as the estimator last filled them
         self.estimate_velocity = _window(swarm.estimate_velocity[row])
-        here = row < len(swarm.ids)
-        self.own_position = _window(swarm.position[:, row]) if here else None  # (3,) own true state
-        self.own_velocity = _window(swarm.velocity[:, row]) if here else None
-        self.goal = _window(swarm.goal[:, row]) if here else None
+        is_local = row < len(swarm.ids)
+        self.own_position = _window(swarm.position[:, row]) if is_local else None  # (3,) own true state
+        self.own_velocity = _window(swarm.velocity[:, row]) if is_local else None
+        self.goal = _window(swarm.goal[:, row]) if is_local else None
 
     def observation(self, slot: int) -> NDArray[np.float32]:
         """What the agent has heard before a slot and its own state, as numbers for learning (docs/how-to/learning.md).
@@ -58,48 +58,48 @@ def _window(array: NDArray[Any]) -> NDArray[Any]:
 
 
 class OwnFrameData(Protocol):
-    """What policies and estimators may have besides: bytes of their own in frames, and the outcome of each slot.
+    """Optional members of policies and estimators: data of their own in frames, and the outcome of each slot.
 
-    All of it may be left out. ``own_bytes``, a class attribute, is the number of bytes, 0 to ``MAX_OWN_BYTES``.
+    ``own_bytes``, a class attribute, is the length of the data, 0 to ``MAX_OWN_BYTES``.
     """
 
     own_bytes: ClassVar[int] = 0
 
-    def say(self, table: Table, slot: int) -> bytes:
-        """The bytes for the frame that this agent sends in a slot: exactly ``own_bytes`` of them."""
+    def own_data(self, table: Table, slot: int) -> bytes:
+        """Return the data for the frame that this agent sends in a slot: exactly ``own_bytes`` bytes."""
 
-    def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
-        """Receive what the same part of another agent has said, in a frame whose state the table has already."""
+    def receive_data(self, table: Table, slot: int, sender: int, data: bytes) -> None:
+        """Receive the data of another agent's same part; the table has the state of the same frame already."""
 
     def slot_over(self, table: Table, slot: int, outcome: SlotOutcome) -> None:
-        """A slot is over for this observer; collisions are silence to receivers that cannot tell."""
+        """Note the outcome of a slot for this observer; receivers without collision detection see silence."""
 
 
 class Policy(Protocol):
-    """Who sends next. It may have what :class:`OwnFrameData` has.
+    """Rule that decides which agent sends next. It may have the members of :class:`OwnFrameData`.
 
-    ``port``, a class attribute, says what it uses of the air (``dtsa_agent.core.registry.PORT``); ``may_join = True``:
-    agents may come late, because nobody needs a table that all have equal.
+    ``port``, a class attribute, lists what it uses of the channel (``dtsa_agent.core.registry.PORT``);
+    ``may_join = True``: agents may join late, because the policy does not need equal tables.
     """
 
     def choose(self, table: Table, slot: int) -> int:
-        """The id that this observer takes for the sender of a slot, 0: nobody. It sends if that is its own."""
+        """Return the id of the agent expected to send in a slot, 0: none. The observer sends if it is its own id."""
 
 
 class Genie(Protocol):
-    """Who sends next, said by one who looks into all agents: a bound to compare with. Made once, for agent 0."""
+    """Central policy that knows all agents' states: a bound for comparison. Created once, for agent 0."""
 
     def senders(self, swarm: Swarm, slot: int) -> Sequence[int]:
-        """The ids that send in a slot; ``swarm``: true states and everybody's table, to be read only."""
+        """Return the ids that send in a slot; ``swarm``: true states and tables of all agents, read-only."""
 
 
 class Radio(Protocol):
     """The radio of an agent that is not bound to slots."""
 
     def send(self) -> bool:
-        """Begin to send the agent's frame, with its state at the start of the slot; False: it still sends another.
+        """Begin to send the agent's frame, with its state at the start of the slot; False: another one is on the air.
 
-        A radio that listens takes the frame, and begins when :meth:`CarrierSensing.sensed` says so.
+        A carrier-sensing radio keeps the frame, and begins when :meth:`CarrierSensing.sensed` returns 0.
         """
 
 
@@ -114,18 +114,18 @@ class UnslottedPolicy(Protocol):
 
 
 class CarrierSensing(UnslottedPolicy, Protocol):
-    """The same with ``busy`` in its ``port``: its radio listens before it sends, as radios do that sense the carrier.
+    """An unslotted policy with ``busy`` in its ``port``: its radio senses the carrier before it sends.
 
-    ``wake`` hands a frame over by ``radio.send()``; what it returns then does not count, and it is not called again
-    before the radio has told what became of the frame.
+    ``wake`` passes a frame on by ``radio.send()``; its return value is then ignored, and it is not called again before
+    :meth:`sent`.
     """
 
     def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> int:
-        """What the radio does that holds a frame and has just listened.
+        """Decide after carrier sensing, while the radio has a frame to send.
 
-        :param busy: whether it has found the air in use, or sends itself.
-        :param sent_ns: ns, when it began its last frame; 0: none yet.
-        :returns: ns until it listens again; 0: it begins now, if the air is free.
+        :param busy: whether the channel is busy, or the radio itself sends.
+        :param sent_ns: start of the radio's last frame, ns; 0: none yet.
+        :returns: ns until the radio senses again; 0: it begins now, if the channel is free.
         """
 
     def sent(self, table: Table, now_ns: int) -> int:
@@ -133,24 +133,24 @@ class CarrierSensing(UnslottedPolicy, Protocol):
 
 
 class PacketRadio(Radio, Protocol):
-    """The radio of an agent whose policy has packets of its own. It sends nothing while it still sends another."""
+    """The radio of an agent whose policy has packets of its own. It sends one packet at a time."""
 
     def send(self, note: bytes = b"", to: int = 0) -> bool:
-        """As for all, with some bytes that precede the frame; ``to``: id of the only agent that takes it in, 0: all."""
+        """Send the frame behind a header ``note``; ``to``: id of the only agent that accepts it, 0: all."""
 
-    def say(self, note: bytes) -> bool:
-        """Begin to send a packet without a frame."""
+    def send_note(self, note: bytes) -> bool:
+        """Begin to send a packet without a frame; False: another one is on the air."""
 
     def frame(self) -> bytes:
-        """The agent's frame, with its state at the start of the slot, for packets of the policy's own.
+        """Return the agent's frame, with its state at the start of the slot, for the policy's own packets.
 
-        The agent counts as having sent it. Empty: it has none.
+        It counts as sent. Empty: the agent has none.
         """
 
-    def take_in(self, frame: bytes, slot: int) -> None:
-        """The agent hears a frame, as its sender's :meth:`frame` gave it in a slot, that its policy has put together.
+    def receive_frame(self, frame: bytes, slot: int) -> None:
+        """Pass a frame to the agent that its policy has decoded from packets.
 
-        The slot may be over for long: a round may take many slots.
+        :param slot: in which the sender's :meth:`frame` returned it, perhaps many slots ago.
         """
 
 
@@ -158,14 +158,14 @@ class PacketReceiver(UnslottedPolicy, Protocol):
     """An unslotted policy that acts on each packet as it arrives, for example a token ring."""
 
     def received(self, table: Table, now_ns: int, sender: int, note: bytes) -> int:
-        """A packet has arrived, as far as the air lets this agent hear it; ``note``: its bytes without the frame.
+        """Receive a packet; ``note``: its bytes without the frame.
 
-        Returns when ``wake`` is to be called next, in place of what was asked for before, ns, later than now.
+        :returns: when to call ``wake`` next, ns, later than now; replaces the time returned before.
         """
 
 
 class Estimator(Protocol):
-    """Where the others are by now. It may have what :class:`OwnFrameData` has.
+    """Estimator of the other agents' present states. It may have the members of :class:`OwnFrameData`.
 
     ``needs_intent = True`` makes frames carry the commanded velocity.
     """
@@ -177,9 +177,9 @@ class Estimator(Protocol):
 
 
 class Avoider(Protocol):
-    """Where to fly. ``model`` names the built-in flight model whose vehicle and spacing are used."""
+    """Collision avoidance. ``model`` names the built-in flight model whose vehicle and spacing are used."""
 
     model: ClassVar[str] = "orca"
 
     def command(self, table: Table, slot: int, step: int) -> Sequence[float]:
-        """Commanded velocity, (3,), m/s, frame map; the estimates in ``table`` are those of this instant."""
+        """Return the commanded velocity, (3,), m/s, frame map; ``table`` has the estimates of this instant."""

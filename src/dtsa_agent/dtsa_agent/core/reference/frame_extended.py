@@ -50,7 +50,7 @@ def encode_extended(frame: ExtendedFrame, position_step: float) -> bytes:
 
     :raises LocalProtocolError: if a field is out of range, or the sections do not fit.
     """
-    if not _sayable(frame):
+    if not _is_encodable(frame):
         raise LocalProtocolError(f"not encodable: {frame}")
     head = bytearray(encode(frame.own, position_step, PROFILE_EXTENDED))
     sections: list[tuple[int, bytes]] = []
@@ -72,7 +72,7 @@ def encode_extended(frame: ExtendedFrame, position_step: float) -> bytes:
     return bytes(head) + body.ljust(SECTIONS * SECTION_BYTES, b"\0")
 
 
-def _sayable(frame: ExtendedFrame) -> bool:
+def _is_encodable(frame: ExtendedFrame) -> bool:
     ahead = [slots for slots, _ in frame.relay]
     return (
         0 <= frame.c_s <= C_S_MAX

@@ -334,7 +334,7 @@ class Station:
             p.report_ns = None if p.report_ns is None else p.report_ns + by_ns
 
     def _names(self, now: Ns) -> list[tuple[int, int]]:
-        """The heard agents in turn, in the order of ids, the last one again: a gap between neighbours tells as well."""
+        """Return heard agents in turn, by id, beginning with the last one: ids between two neighbours are not heard."""
         heard = [k for k, p in enumerate(self.peers) if p.offset_ns is not None and self._hears(p, now)]
         count, turn = min(len(heard), self.settings.link.names), self.name_turn
         named = [heard[(turn + i) % len(heard)] for i in range(count)]
@@ -342,7 +342,7 @@ class Station:
             self.name_turn = (turn % len(heard) + (count - 1 if count > 1 else count)) % len(heard)
         return [(k + 1, self.peers[k].offset_ns or 0) for k in named]
 
-    # Who hears whom.
+    # Which agents hear each other.
 
     def _is_recent(self, p: Peer, when: Ns | None, now: Ns) -> bool:
         return when is not None and now - when <= (self.resting_ns if p.resting else self.moving_ns)
@@ -366,7 +366,7 @@ class Station:
             p.report_ns = p.sum_ns = None
 
     def _has_quorum(self, now: Ns) -> bool:
-        """Whether it hears, and is heard by, enough of those that have not left; one that has not said: as most say."""
+        """Whether it hears, and is heard by, enough agents that have not left; unknown ones count like the majority."""
         c, link = self.settings, self.settings.link
         others = [p for k, p in enumerate(self.peers) if k != c.id - 1 and not p.left]
         says = [p.hears_us for p in others]
@@ -375,7 +375,7 @@ class Station:
         hears = [self._hears(p, now) for p in others]
         n = len(others)
         if self.refused_since is not None and now - self.refused_since > HALF_SECOND_NS:
-            heard_by = [False] * n  # nothing leaves it
+            heard_by = [False] * n  # the port refuses its datagrams
         needed = c.quorum if c.quorum >= 0 else max(n - 1, min(n, 1))
         if c.quorum == SHARE:
             needed = math.ceil(n * c.quorum_share - 1e-9)
@@ -392,7 +392,7 @@ class Station:
         self.running, self.frame = False, b""
 
     def _restart(self, now: Ns) -> None:
-        """From the next slot on it takes part, knowing nothing."""
+        """Forget all frames; the agent takes part from the next slot on."""
         if self.frame:
             self.pending = b""
         self._close_slot()
@@ -406,7 +406,7 @@ class Station:
         self.agent.restart()
         self.on_restart()
 
-    def _hear_frame(self, slot: int, frame: bytes) -> None:
+    def _receive_frame(self, slot: int, frame: bytes) -> None:
         try:
             parsed, sampled = parse(frame, slot, self.rules)
             if self.agent.present:
@@ -416,10 +416,10 @@ class Station:
         if self.awaits and slot >= self.slot:
             self.awaits = False
 
-    def _why_it_hovers(self, slot: int, now: Ns) -> int:
+    def _find_hover_reason(self, slot: int, now: Ns) -> int:
         quorum = self._has_quorum(now)
         on_probation = self.rules.policy == "lease" and self.agent.memory.probation
-        if self._is_doubled(now):
+        if self._has_id_conflict(now):
             return HOVERS_SAME_ID
         if self.has_sent and slot >= self.first + self.rules.agents and not on_probation:
             self.newcomer = False
@@ -427,24 +427,28 @@ class Station:
             return HOVERS_NEW
         return FLIES if quorum else HOVERS_QUORUM
 
-    def _is_doubled(self, now: Ns) -> bool:
+    def _has_id_conflict(self, now: Ns) -> bool:
         """Whether another agent has sent with the own id lately."""
         return self.same_id_until is not None and now < self.same_id_until
 
-    def _leaves_out(self, slot: int, now: Ns) -> bool:
-        """An agent that is new sends nothing while another sends with its id: that one was here before. One that hears
-        nothing leaves out half of its frames: those of agents in other times may cover them."""
+    def _withholds_frame(self, slot: int, now: Ns) -> bool:
+        """Whether the agent does not send its frame.
+
+        A new agent is silent while another one sends with its id: the other was here first. One that has received no
+        frame for long sends half of its frames, at random: the others may collide with frames of agents whose slots
+        begin at other times.
+        """
         is_deaf = now - self.heard_ns > self.patience_ns and not self.settings.keeps_time
-        return (self.newcomer and self._is_doubled(now)) or (is_deaf and bool(self._draw(slot) & 1))
+        return (self.newcomer and self._has_id_conflict(now)) or (is_deaf and bool(self._draw(slot) & 1))
 
     def _open_slot(self, slot: int, now: Ns) -> None:
         self._close_slot()
-        self.hovers, self.slot = self._why_it_hovers(slot, now), slot
-        if self.leaving and not self.gone:  # its last frame did not leave
+        self.hovers, self.slot = self._find_hover_reason(slot, now), slot
+        if self.leaving and not self.gone:  # its last frame was not sent
             self.agent.present = LEAVES
         chosen = self.agent.decide(slot).index + 1
         self.pending = self.frame = self.agent.frame(slot) if self.agent.sends else b""
-        if self.frame and self._leaves_out(slot, now):
+        if self.frame and self._withholds_frame(slot, now):
             self.pending = self.frame = b""
         self.running, self.awaits = True, chosen not in (0, self.settings.id)
         early, self.early = self.early, []
@@ -452,22 +456,22 @@ class Station:
             if entry[0] > slot:
                 self.early.append(entry)
             else:
-                self._hear_frame(entry[0], entry[2])
+                self._receive_frame(entry[0], entry[2])
 
     def receive(self, data: Datagram, arrival: Ns) -> int:
-        """Accepts a datagram, or says why not. Anything may be handed in."""
+        """Receive a datagram, of any bytes; return ACCEPTED, or why it is refused."""
         d = self._parse(data)
         if isinstance(d, int):
             return d
         c, slot_ns = self.settings, self.settings.slot_ns
         listens, began = self.state == LISTENING, arrival - c.link.flight_ns - d.late_ns
         start = began - self.flight_error_ns
-        here = d.slot if listens else self._slot_at(start)
-        slot = d.slot if listens else here + centred(d.slot - here, self.cycle)
+        present = d.slot if listens else self._slot_at(start)
+        slot = d.slot if listens else present + centred(d.slot - present, self.cycle)
         expected = self.slot_start_ns(slot)
         p = self.peers[d.sender - 1]
         if d.sender == c.id:
-            return OTHER_TIME if listens else self._hear_own_id(data, arrival, start - expected)
+            return OTHER_TIME if listens else self._classify_own_id(data, arrival, start - expected)
         if p.last_slot == d.slot and not listens:
             return REPEATED
         p.last_slot, self.heard_ns = d.slot, arrival
@@ -485,11 +489,11 @@ class Station:
             if len(self.early) < c.early_count:
                 self.early.append((slot, d.sender, d.frame))
         elif slot >= self.first - 1:
-            self._hear_frame(slot, d.frame)
+            self._receive_frame(slot, d.frame)
         return ACCEPTED
 
-    def _hear_own_id(self, data: Datagram, arrival: Ns, apart: int) -> int:
-        """An echo or a replay of an own datagram, or another agent of the same id."""
+    def _classify_own_id(self, data: Datagram, arrival: Ns, apart: int) -> int:
+        """Classify a datagram with the own id: echo or replay of an own one, or another agent with that id."""
         half = self.settings.slot_ns // 2
         if data in self.sent_history:
             return REPEATED
@@ -508,7 +512,7 @@ class Station:
         return following - (self.latest_lead_ns if must_decide else self.lead_ns)
 
     def step(self, now: Ns) -> tuple[Ns, Datagram]:
-        """Do one thing that is due; when to call again (not after now: at once), and what to send now."""
+        """Do one step that is due; return when to call again (not after now: at once), and the datagram to send."""
         datagram, due = b"", self._due_ns(now)
         if now < due:
             return due, b""

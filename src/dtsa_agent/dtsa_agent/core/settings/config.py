@@ -48,7 +48,9 @@ class SwarmConfig(Settings):
         minimum=0,
         maximum=MAX_AGENTS,
     )
-    policy: str = setting("dtsa", "rule by which agents decide who sends", choices=POLICIES.names, open_choices=True)
+    policy: str = setting(
+        "dtsa", "rule by which agents decide which agent sends", choices=POLICIES.names, open_choices=True
+    )
     estimator: str = setting("linear", "where the others are by now", choices=ESTIMATORS.names, open_choices=True)
     avoider: str = setting(
         "orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS.names, open_choices=True
@@ -100,7 +102,7 @@ class SwarmConfig(Settings):
     gossip: bool = setting(True, "extended frames carry what their sender last heard of others")
     anchor_every: int = setting(
         3,
-        "lease: every so many rounds an agent's turn is an anchor: nobody else gives it away, M",
+        "lease: every so many rounds an agent's turn is an anchor: no other agent gives it away, M",
         minimum=1,
         maximum=MOST_ROUNDS,
     )
@@ -113,7 +115,7 @@ class SwarmConfig(Settings):
     )
     open_every: int = setting(
         11,
-        "lease: one of so many turns of those that rest is open to all who wake, S (at least N / 5); 0: none",
+        "lease: one of so many turns of resting agents is open to all that start moving, S (at least N / 5); 0: none",
         minimum=0,
         maximum=1000,
     )

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from dtsa_agent.core.errors import UNKNOWN, ConfigError, range_text
+from dtsa_agent.core.errors import SETTING_NAMES, ConfigError, range_text
 
 #: The default of a setting that has none.
 REQUIRED: Any = dataclasses.MISSING
@@ -231,7 +231,7 @@ def build(cls: type[T], values: Mapping[str, Any]) -> T:
     arguments = dict(names_with_values(values, "settings"))
     for name, value in arguments.items():
         if name not in specs:
-            raise ConfigError(str(name), value, UNKNOWN + ", ".join(specs))
+            raise ConfigError(str(name), value, SETTING_NAMES + ", ".join(specs))
         section = specs[name].section
         if section and isinstance(value, Mapping):
             with named(name):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.errors import UNKNOWN, ConfigError
+from dtsa_agent.core.errors import SETTING_NAMES, ConfigError
 from dtsa_agent.core.kernel import NAMES, ffi, lib, memory
 from dtsa_agent.core.registry import Registry
 
@@ -146,7 +146,7 @@ def flight_model(name: str, options: Mapping[str, float] | None = None) -> Fligh
         if "." in key:
             continue
         if key not in owners:
-            raise ConfigError(f"options.{key}", value, UNKNOWN + ", ".join(owners))
+            raise ConfigError(f"options.{key}", value, SETTING_NAMES + ", ".join(owners))
         groups[owners[key]][key] = value
     return dataclasses.replace(
         model,

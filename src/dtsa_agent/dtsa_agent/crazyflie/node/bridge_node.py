@@ -35,7 +35,7 @@ from dtsa_agent.ros.common.node_process import follow_supervisor, init_ros, limi
 from dtsa_agent.ros.common.parameters import check_parameters, declare_settings
 
 from .interfaces import NODE
-from .preflight import FAIL, preflight
+from .preflight import FAIL, check_preflight
 from .topics import BridgeInputs, BridgeOutputs, helper_node, subscribe_positions
 
 STATUS_HZ = 5.0
@@ -75,7 +75,7 @@ class BridgeNode(Node):
         self.bridge = Bridge(self.settings, self.log, self.outputs.publish_state)
         self.command_thread = CommandThread(helper_node(self, "commands"))
         self._inputs = BridgeInputs(self, self.bridge, self.command_thread, self.log)
-        self.positions = CommandThread(helper_node(self, "positions")) if positions.on else None
+        self.positions = CommandThread(helper_node(self, "positions")) if positions.enabled else None
         if self.positions is not None:
             subscribe_positions(self.positions, positions, self.bridge.vehicles)
 
@@ -115,7 +115,7 @@ class BridgeNode(Node):
             self.log("warn", f"not connected: {', '.join(missing)} (service reconnect)")
         if self.bridge.connected < self.settings.station.min_connected:
             return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
-        if self.settings.station.on_board.on:
+        if self.settings.station.on_board.enabled:
             if problem := self.bridge.start_agents():
                 return problem
             rate = self.settings.station.on_board.polls_hz
@@ -194,7 +194,7 @@ def check_node(node: BridgeNode, print_line: Callable[[str], None]) -> int:
     node.bridge.connect(stop=interrupts.any)
     interrupts.wait(SETTLE_S)  # rates and qualities are counted over a second
     firmware = {v.name: v.link.firmware for v in node.bridge.vehicles.values() if v.link.firmware is not None}
-    findings = preflight(node.settings, node.bridge.snapshots(), firmware, node.bridge.radios, problem)
+    findings = check_preflight(node.settings, node.bridge.snapshots(), firmware, node.bridge.radios, problem)
     node.bridge.close()
     for finding in findings:
         print_line(str(finding))

@@ -80,7 +80,7 @@ class BridgeInputs:
 
     def __init__(self, node: Node, bridge: Bridge, commands: CommandThread, log: LogLine) -> None:
         self._node, self._bridge, self._commands, self._log = node, bridge, commands, log
-        self._on_board = bridge.settings.station.on_board.on
+        self._on_board = bridge.settings.station.on_board.enabled
         self._waiting = ReentrantCallbackGroup()  # of services that wait: the others are served meanwhile
         self._masks = {name: vehicle.robot.group_mask for name, vehicle in bridge.vehicles.items()}
 
@@ -143,7 +143,7 @@ class BridgeInputs:
         """Give an order to those that are addressed (group 0: to all of them; else to those in one of these groups)."""
         members = [name for name in names if not group or self._masks[name] & group]
         if not members:
-            return False, f"nobody of {', '.join(names)} is in a group of {group}"
+            return False, f"none of {', '.join(names)} is in a group of {group}"
         return self._bridge.order_each(members, order)
 
     def _refuse(self, names: list[str], request: Any) -> tuple[bool, str]:
@@ -237,7 +237,7 @@ def subscribe_positions(
     if settings.source == NAMED_POSES:
         for topic in sorted({settings.topic_of(name) for name in vehicles}):
             poses.subscribe(named_pose_array(), topic, partial(_named, vehicles), SENSOR)
-    elif settings.on:
+    elif settings.enabled:
         for name, vehicle in vehicles.items():
             take = lambda message, info, vehicle=vehicle: _see(vehicle, message.header, message.pose)  # noqa: E731
             poses.subscribe(PoseStamped, settings.topic_of(name), take, SENSOR)
@@ -274,7 +274,7 @@ class BridgeOutputs:
         for robot in settings.robots:
             name = robot.name
             self._odom[name] = node.create_publisher(Odometry, f"{name}/odom", LATEST_ONLY)
-            if not positions.on or positions.topic_of(name).lstrip("/") != f"{name}/pose":  # motion capture's own
+            if not positions.enabled or positions.topic_of(name).lstrip("/") != f"{name}/pose":  # motion capture's own
                 self._pose[name] = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
             self._state[name] = node.create_publisher(StateMessage, f"{name}/{STATE}", QoSProfile(depth=10))
             if STATE != "status":
@@ -384,7 +384,7 @@ def diagnostic(s: Snapshot, now: float) -> DiagnosticStatus:
     }
     if s.tracker is not None:
         values |= position_values(s.tracker, now)
-        if level == DiagnosticStatus.OK and s.tracker.rate(now) == 0.0:
+        if level == DiagnosticStatus.OK and s.tracker.rate_hz(now) == 0.0:
             level = DiagnosticStatus.WARN
     pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
     name = f"crazyflie_bridge: {s.name}"
@@ -395,11 +395,11 @@ def position_values(tracker: PoseTracker, now: float) -> dict[str, str]:
     """Return what /diagnostics says about motion capture and one vehicle."""
     refused = ", ".join(f"{kind} {number}" for kind, number in sorted(tracker.refused.items()))
     return {
-        "positions [Hz]": f"{tracker.rate(now):.0f}",
+        "positions [Hz]": f"{tracker.rate_hz(now):.0f}",
         "positions sent": str(tracker.sent),
         "position age [s]": f"{tracker.age(now):.2f}",
-        "position latency, median [ms]": f"{tracker.latency(0.5) * 1000:.1f}",
-        "position latency, 99th percentile [ms]": f"{tracker.latency(0.99) * 1000:.1f}",
+        "position latency, median [ms]": f"{tracker.latency_quantile(0.5) * 1000:.1f}",
+        "position latency, 99th percentile [ms]": f"{tracker.latency_quantile(0.99) * 1000:.1f}",
         "positions refused": refused or "0",
         "last refusal": tracker.reason,
     }

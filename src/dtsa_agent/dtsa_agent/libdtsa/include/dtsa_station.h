@@ -63,19 +63,20 @@ typedef struct dtsa_station_settings {
     dtsa_link link;
 } dtsa_station_settings;
 
-/* How regularly agents send: lease, in anchors; policies with turns; those that draw lots, and in which
- * agents that have arrived may be silent for ever. */
+/* How regularly agents send: in anchors (lease); in turns; at random, so that agents at their goals may
+ * stay silent for ever. */
 enum { DTSA_SENDS_IN_ANCHORS, DTSA_SENDS_IN_TURNS, DTSA_SENDS_BY_CHANCE };
 
-/* What it does at first: it listens; slot 0 of all starts at origin_ns, and it flies from there; it
- * listens, and if it hears no frame slot 0 has started at origin_ns. */
+/* How a station begins: listening; together, with slot 0 of all agents at origin_ns; or late: it
+ * listens, and if no frame arrives, slot 0 began at origin_ns. */
 enum { DTSA_BEGINS_LISTENING, DTSA_BEGINS_TOGETHER, DTSA_BEGINS_LATE };
 
-/* Whether slots move: as the rules say, also to another time; a little, with frames that fit; never. */
+/* Whether slot times move: by the rules, also to those of other agents; slightly, by frames that fit;
+ * never. */
 enum { DTSA_KEEPS_NOTHING, DTSA_KEEPS_NUMBERS, DTSA_KEEPS_STARTS };
 
-/* The agent behind a station. open: a slot opens; decide, return the length of the frame to send
- * (0: silent), and whom it expects to send. hovers: it is to stay where it is. */
+/* The agent of a station. open: decide for a slot that opens; return the length of the frame to send
+ * (0: silent), and in chosen the id expected to send. hovers: the agent must stay where it is. */
 typedef struct dtsa_station_agent {
     void *context;
     int (*open)(void *context, int64_t slot, int hovers, uint8_t frame[DTSA_DATAGRAM_MAX],
@@ -85,7 +86,8 @@ typedef struct dtsa_station_agent {
     void (*close)(void *context, int64_t slot); /* the slot is over */
     void (*restart)(void *context);             /* it forgets all but settings, state and goal */
     int (*leave)(
-        void *context); /* 1: its next frame says that it leaves; 0: it is off. Maybe again */
+        void *context); /* 1: its next frame has the leaving flag; 0: it is off at once. May
+                                    be called repeatedly */
     int (*on_probation)(void *context); /* policy lease */
 } dtsa_station_agent;
 
@@ -108,14 +110,14 @@ typedef enum dtsa_verdict {
     DTSA_VERDICT_COUNT
 } dtsa_verdict;
 
-/* Whether it knows which slot it is. */
+/* Whether the station knows the number of the present slot. */
 enum {
     DTSA_LISTENING,
-    DTSA_ALONE, /* it has begun by its own clock, and heard no frame of this time */
+    DTSA_ALONE, /* began by its own clock; no frame of these slot times has arrived */
     DTSA_JOINED
 };
 
-/* Why it hovers. */
+/* Why the agent hovers. */
 enum {
     DTSA_FLIES,
     DTSA_HOVERS_LISTENING, /* does not know yet which slot it is */
@@ -130,15 +132,15 @@ typedef struct dtsa_station_status {
     int hovers;          /* DTSA_FLIES.. */
     int64_t slot, first; /* present slot, and the one with which it began; -1 */
     int others, hears, heard_by, both, needed; /* agents, see the quorum */
-    int gone;                                  /* it has said that it leaves */
-    int in_step;                               /* agents heard in the own time, itself included */
-    int64_t flight_error_ns; /* how much longer frames are under way than the link says */
+    int gone;                                  /* a frame with the leaving flag was sent */
+    int in_step;             /* agents heard in the own slot times, itself included */
+    int64_t flight_error_ns; /* measured flight time of frames minus the link's flight_ns */
     uint32_t slots, sent, unsent, heard, restarts, shifts, alignments;
     uint32_t refused[DTSA_VERDICT_COUNT];
-    int64_t timed, off; /* frames of about the own time; off by over a quarter of a slot */
+    int64_t timed, off; /* frames near the own slot times; those off by over a quarter of a slot */
 } dtsa_station_status;
 
-/* Is told what happens, for a record; any function may be NULL. */
+/* Callbacks for a record; any may be NULL. */
 typedef struct dtsa_station_events {
     void *context;
     void (*opened)(void *context, int64_t slot, int64_t start_ns, int64_t now_ns, int is_first);
@@ -151,8 +153,7 @@ typedef struct dtsa_station_events {
                     int64_t arrival_ns);
 } dtsa_station_events;
 
-/* What a datagram says. An agent that it names is one that its sender hears, and how much later than
- * expected. */
+/* Contents of a datagram. It names agents that its sender hears, and how much later than expected. */
 typedef struct dtsa_named {
     int id; /* 0: none */
     int64_t late_ns;
@@ -167,21 +168,21 @@ typedef struct dtsa_datagram {
     long frame_length;    /* without the tag */
 } dtsa_datagram;
 
-/* Anything may be handed in; *out counts if it is DTSA_ACCEPTED. */
+/* Any bytes are allowed; *out is valid if the result is DTSA_ACCEPTED. */
 DTSA_API dtsa_verdict dtsa_datagram_read(const dtsa_station_settings *settings, const uint8_t *data,
                                          long length, dtsa_datagram *out);
 /* The length of the datagram of a frame; out: room for DTSA_DATAGRAM_MAX bytes. */
 DTSA_API int dtsa_datagram_write(const dtsa_station_settings *settings, const uint8_t *frame,
                                  uint32_t slot, int64_t late_ns,
                                  const dtsa_named names[DTSA_NAMES_MAX], uint8_t *out);
-/* Whether the sender of a list of `count` names, of `most` that fit, hears an agent: 1, -1, or 0: the
- * list does not tell. */
+/* Whether the sender of a list of `count` names, of at most `most`, hears an agent: 1: yes, -1: no,
+ * 0: the list leaves it open. */
 DTSA_API int dtsa_names_hear(const dtsa_named *names, int count, int most, int agent);
 DTSA_API int dtsa_datagram_length(const dtsa_station_settings *settings);
 
 typedef struct dtsa_station dtsa_station;
 
-/* After how long a stand-still an agent restarts, ns: others may think it dead. */
+/* An agent that did not run for this long restarts, ns: the others may consider it absent. */
 DTSA_API int64_t dtsa_station_too_long(const dtsa_station_settings *settings);
 DTSA_API size_t dtsa_station_bytes(const dtsa_station_settings *settings);
 /* In `memory`, aligned for doubles; NULL: too small, or settings are not usable. Settings are copied
@@ -190,24 +191,24 @@ DTSA_API dtsa_station *dtsa_station_start(void *memory, size_t bytes,
                                           const dtsa_station_settings *settings,
                                           const dtsa_station_agent *agent, int64_t now_ns);
 DTSA_API void dtsa_station_observe(dtsa_station *station, const dtsa_station_events *events);
-/* Anything may be handed in. */
+/* Any bytes are allowed. */
 DTSA_API dtsa_verdict dtsa_station_receive(dtsa_station *station, const uint8_t *data, long length,
                                            int64_t arrival_ns);
-/* Does one thing that is due; the agent's state at this moment counts. Returns when to call again at
- * the latest (not after now: at once). datagram: room for DTSA_DATAGRAM_MAX bytes, or for the length of one. */
+/* Does one step that is due, with the agent's present state. Returns when to call again at the latest
+ * (not after now: at once). datagram: room for DTSA_DATAGRAM_MAX bytes, or for the length of one. */
 DTSA_API int64_t dtsa_station_step(dtsa_station *station, int64_t now_ns, uint8_t *datagram,
                                    int *length);
-/* What became of the datagram that the last step gave: taken 0: the port refused it. */
-DTSA_API void dtsa_station_sent(dtsa_station *station, int64_t now_ns, int taken);
-/* It says on the air that it leaves, where the frames can say so. */
+/* Whether the port accepted the datagram of the last step. */
+DTSA_API void dtsa_station_sent(dtsa_station *station, int64_t now_ns, int accepted);
+/* Its next frame announces that it leaves, if the policy's frames can. */
 DTSA_API void dtsa_station_leave(dtsa_station *station);
-/* Whether a datagram may make it due earlier: before that the others may wait in the port. */
+/* Whether the next datagram may make it due earlier; if not, datagrams may wait in the port. */
 DTSA_API int dtsa_station_awaits_frame(const dtsa_station *station, int64_t now_ns);
 DTSA_API int dtsa_station_hovers(const dtsa_station *station);   /* DTSA_FLIES.. in this slot */
 DTSA_API int64_t dtsa_station_slot(const dtsa_station *station); /* -1: none yet */
 DTSA_API int64_t dtsa_station_slot_start(const dtsa_station *station, int64_t slot);
-/* The longest that it has waited for a frame of an agent, slots; it had heard the agent before, and
- * the agent had not left. 0, and no agent: none. */
+/* The longest gap between two frames of an agent that had not left, slots, and the agent's id; 0, 0:
+ * none yet. */
 DTSA_API int64_t dtsa_station_longest_gap(dtsa_station *station, int *agent);
 DTSA_API void dtsa_station_get_status(const dtsa_station *station, dtsa_station_status *status);
 

@@ -1,22 +1,22 @@
-/* The loop of one agent: it listens, takes the time of the first frame that it hears or begins one of
- * its own, and from then on opens slot after slot and sends when its turn has come. */
+/* The loop of one station. It listens first; it takes the slot times of the first frame that arrives,
+ * or begins by its own clock. Then it opens slot after slot, and sends in the turns of its agent. */
 #include <string.h>
 
 #include "core.h"
 #include "policy/policy.h"
 #include "station.h"
 
-/* Of a slot, in thousandths: an agent that has heard all it waits for decides so long before the slot
- * starts; one that waits for a frame only so long. */
+/* In thousandths of a slot: an agent decides LEAD before the slot starts; if it still waits for the
+ * present slot's frame, LATEST_LEAD before. */
 enum { LEAD = 700, LATEST_LEAD = 200 };
-/* Where tables have to be equal it waits so long beyond the start, in thousandths and ns at most: a late
- * frame costs less than tables that differ. */
-enum { LONGEST_WAIT = 300, LONGEST_WAIT_NS = 3000000 };
-static const int64_t HALF_SECOND = 500000000;
+/* If the policy needs equal tables, it waits for the frame until after the start: thousandths of a slot,
+ * and ns, whichever is less. Sending late costs less than tables that differ. */
+enum { MAX_WAIT = 300, MAX_WAIT_NS = 3000000 };
+static const int64_t HALF_SECOND_NS = 500000000;
 
-static int64_t share(int64_t slot_ns, int thousandths) { return slot_ns * thousandths / 1000; }
+static int64_t slot_share(int64_t slot_ns, int thousandths) { return slot_ns * thousandths / 1000; }
 
-/* ---- made ---- */
+/* ---- set-up ---- */
 
 static int is_usable(const dtsa_station_settings *c)
 {
@@ -30,18 +30,19 @@ static int is_usable(const dtsa_station_settings *c)
            datagram_head(link) + c->frame_length + DTSA_TAG_BYTES <= DTSA_DATAGRAM_MAX;
 }
 
-static size_t rounded(size_t bytes) { return (bytes + 7) / 8 * 8; }
+static size_t aligned(size_t bytes) { return (bytes + 7) / 8 * 8; }
 
 size_t dtsa_station_bytes(const dtsa_station_settings *c)
 {
     if (!is_usable(c)) return 0;
     const size_t n = (size_t)c->agents, early = (size_t)c->early_count;
-    return rounded(sizeof(dtsa_station)) + n * sizeof(peer) + n * sizeof(int64_t) +
-           early * sizeof(early_frame) + rounded(DTSA_DATAGRAM_MAX) +
-           rounded(early * (size_t)dtsa_datagram_length(c));
+    return aligned(sizeof(dtsa_station)) + n * sizeof(peer) + n * sizeof(int64_t) +
+           early * sizeof(early_frame) + aligned(DTSA_DATAGRAM_MAX) +
+           aligned(early * (size_t)dtsa_datagram_length(c));
 }
 
-static void lay_out(dtsa_station *s, uint8_t *at)
+/* Places the arrays in the memory behind the station. */
+static void place_arrays(dtsa_station *s, uint8_t *at)
 {
     const size_t n = (size_t)s->settings.agents, early = (size_t)s->settings.early_count;
     s->peers = (peer *)at;
@@ -51,7 +52,7 @@ static void lay_out(dtsa_station *s, uint8_t *at)
     s->early = (early_frame *)at;
     at += early * sizeof(early_frame);
     s->frame = at;
-    at += rounded(DTSA_DATAGRAM_MAX);
+    at += aligned(DTSA_DATAGRAM_MAX);
     for (size_t i = 0; i < early; i++) s->early[i].datagram = at + i * (size_t)s->datagram_length;
     for (size_t k = 0; k < n; k++)
         s->peers[k] = (peer){.heard_ns = INT64_MIN, .near_ns = INT64_MIN, .last_slot = -1};
@@ -69,23 +70,24 @@ static void set_times(dtsa_station *s)
     const int64_t slot = c->slot_ns, anchors = (int64_t)c->anchor_every * c->agents * slot,
                   mains = (int64_t)c->main_every * c->agents * slot;
     s->round_ns = anchors;
-    s->moving_ns = larger((c->sends == DTSA_SENDS_BY_CHANCE ? 18 : 2) * anchors, HALF_SECOND);
-    s->resting_ns = c->sends == DTSA_SENDS_IN_ANCHORS ? larger(6 * mains, HALF_SECOND)
+    s->moving_ns = larger((c->sends == DTSA_SENDS_BY_CHANCE ? 18 : 2) * anchors, HALF_SECOND_NS);
+    s->resting_ns = c->sends == DTSA_SENDS_IN_ANCHORS ? larger(6 * mains, HALF_SECOND_NS)
                     : c->sends == DTSA_SENDS_IN_TURNS ? s->moving_ns
                                                       : INT64_MAX;
-    s->patience_ns = larger(2 * mains, HALF_SECOND);
-    s->lead_ns = share(slot, LEAD);
-    s->latest_lead_ns = c->equal_tables ? -smaller(share(slot, LONGEST_WAIT), LONGEST_WAIT_NS)
-                                        : share(slot, LATEST_LEAD);
-    s->latest_send_ns = larger(slot - c->link.flight_ns - share(slot, DTSA_BETWEEN), slot / 10);
+    s->patience_ns = larger(2 * mains, HALF_SECOND_NS);
+    s->lead_ns = slot_share(slot, LEAD);
+    s->latest_lead_ns = c->equal_tables ? -smaller(slot_share(slot, MAX_WAIT), MAX_WAIT_NS)
+                                        : slot_share(slot, LATEST_LEAD);
+    s->latest_send_ns =
+        larger(slot - c->link.flight_ns - slot_share(slot, DTSA_BETWEEN), slot / 10);
     s->too_long_ns = dtsa_station_too_long(c);
 }
 
-/* A number that looks random. */
-static uint64_t draw(const dtsa_station *s, uint64_t what)
+/* A pseudo-random number, by seed, id and index. */
+static uint64_t draw(const dtsa_station *s, uint64_t index)
 {
     return mix64(s->settings.seed * 0x9e3779b97f4a7c15ULL +
-                 (uint64_t)s->settings.id * 0xd1b54a32d192ed03ULL + what * 0x8cb92ba72f3d8dd7ULL -
+                 (uint64_t)s->settings.id * 0xd1b54a32d192ed03ULL + index * 0x8cb92ba72f3d8dd7ULL -
                  0x9e3779b97f4a7c15ULL);
 }
 
@@ -102,7 +104,7 @@ dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_
     s->agent = *agent;
     s->datagram_length = dtsa_datagram_length(settings);
     s->head_length = datagram_head(&settings->link);
-    lay_out(s, (uint8_t *)memory + rounded(sizeof *s));
+    place_arrays(s, (uint8_t *)memory + aligned(sizeof *s));
     set_times(s);
     s->slot = s->first = -1;
     s->same_id_until = s->refused_since = s->earlier_ns = INT64_MIN;
@@ -114,8 +116,8 @@ dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_
         s->in_step_ns = now;
         s->first = 0;
     } else {
-        /* Spread over a round of anchors: one agent is the first, and the others hear it while they
-         * still listen. */
+        /* The ends of listening are spread over a round of anchors: one agent begins first, and the
+         * others receive its frames while they still listen. */
         s->state = DTSA_LISTENING;
         s->deadline_ns = now + s->round_ns + (int64_t)(draw(s, 0) % (uint64_t)s->round_ns);
     }
@@ -137,7 +139,7 @@ int64_t dtsa_station_slot_start(const dtsa_station *s, int64_t slot)
 static void close_slot(dtsa_station *s)
 {
     if (!s->running) return;
-    if (s->frame_length) { /* it restarts before its turn has come */
+    if (s->frame_length) { /* a restart before the frame was sent */
         s->agent.unsent(s->agent.context);
         s->frame_length = 0;
     }
@@ -146,7 +148,7 @@ static void close_slot(dtsa_station *s)
     s->running = 0;
 }
 
-/* From the next slot on it takes part, knowing nothing. */
+/* The agent forgets all frames, and takes part from the next slot on. */
 static void restart(dtsa_station *s, int64_t now)
 {
     close_slot(s);
@@ -165,8 +167,8 @@ static void restart(dtsa_station *s, int64_t now)
     s->counts.restarts++;
 }
 
-/* An agent that is not new has waited for a frame of another one until a slot. */
-static void note_gap(dtsa_station *s, int k, int64_t slot)
+/* Updates the longest gap with the slots since agent k's last frame, unless this agent is new. */
+static void update_longest_gap(dtsa_station *s, int k, int64_t slot)
 {
     const peer *p = &s->peers[k];
     const int32_t gap = (int32_t)((uint32_t)slot - p->heard_slot);
@@ -175,14 +177,14 @@ static void note_gap(dtsa_station *s, int k, int64_t slot)
     s->longest_of = k + 1;
 }
 
-static void hear_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t *datagram,
-                       int64_t arrival)
+static void receive_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t *datagram,
+                          int64_t arrival)
 {
     const int accepted =
         s->agent.hear(s->agent.context, slot, datagram + s->head_length, s->settings.frame_length);
     if (accepted) {
         s->counts.heard++;
-        note_gap(s, sender - 1, slot);
+        update_longest_gap(s, sender - 1, slot);
         s->peers[sender - 1].heard_slot = (uint32_t)slot;
         s->peers[sender - 1].was_heard = !s->peers[sender - 1].left;
     }
@@ -192,7 +194,7 @@ static void hear_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t 
                         accepted);
 }
 
-/* Whether it hovers because the others do not know it yet, or it does not know them. */
+/* Whether the agent is new: the others do not know it yet, or it does not know them. */
 static int is_new(dtsa_station *s, int64_t slot, int64_t now)
 {
     if (s->newcomer && s->has_sent && slot >= s->first + s->settings.agents &&
@@ -201,7 +203,7 @@ static int is_new(dtsa_station *s, int64_t slot, int64_t now)
     return s->newcomer;
 }
 
-static int why_it_hovers(dtsa_station *s, int64_t slot, int64_t now)
+static int find_hover_reason(dtsa_station *s, int64_t slot, int64_t now)
 {
     const int quorum = contacts_have_quorum(s, now);
     const int newcomer = is_new(s, slot, now);
@@ -210,7 +212,8 @@ static int why_it_hovers(dtsa_station *s, int64_t slot, int64_t now)
     return quorum ? DTSA_FLIES : DTSA_HOVERS_QUORUM;
 }
 
-static void hear_early(dtsa_station *s)
+/* Receives the stored frames whose slot has begun. */
+static void receive_early_frames(dtsa_station *s)
 {
     int kept = 0;
     for (int i = 0; i < s->early_count; i++) {
@@ -219,15 +222,16 @@ static void hear_early(dtsa_station *s)
             s->early[i] = s->early[kept];
             s->early[kept++] = e;
         } else {
-            hear_frame(s, e.sender, e.slot, e.datagram, e.arrival_ns);
+            receive_frame(s, e.sender, e.slot, e.datagram, e.arrival_ns);
         }
     }
     s->early_count = kept;
 }
 
-/* An agent that is new sends nothing while another one sends with its id: that one was here before. One
- * that hears nothing leaves out half of its frames: those of agents in other times may cover them. */
-static int leaves_out(const dtsa_station *s, int64_t slot, int64_t now)
+/* Whether the agent does not send its frame. A new agent is silent while another one sends with its id:
+ * the other was here first. One that has received no frame for long sends half of its frames, at random:
+ * the others may collide with frames of agents whose slots begin at other times. */
+static int withholds_frame(const dtsa_station *s, int64_t slot, int64_t now)
 {
     return (s->newcomer && now < s->same_id_until) ||
            (now - s->heard_ns > s->patience_ns && !s->settings.keeps_time &&
@@ -238,9 +242,9 @@ static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
 {
     int chosen = 0;
     close_slot(s);
-    s->hovers = why_it_hovers(s, slot, now);
+    s->hovers = find_hover_reason(s, slot, now);
     s->slot = slot;
-    if (s->leaving && !s->gone) s->agent.leave(s->agent.context); /* its last frame did not leave */
+    if (s->leaving && !s->gone) s->agent.leave(s->agent.context); /* its last frame was not sent */
     s->frame_length =
         s->agent.open(s->agent.context, slot, s->hovers != DTSA_FLIES, s->frame, &chosen);
     s->running = 1;
@@ -248,17 +252,18 @@ static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
     if (s->events.opened)
         s->events.opened(s->events.context, slot, dtsa_station_slot_start(s, slot), now,
                          slot == s->first);
-    if (s->frame_length && leaves_out(s, slot, now)) {
+    if (s->frame_length && withholds_frame(s, slot, now)) {
         s->agent.unsent(s->agent.context);
         s->frame_length = 0;
     }
-    hear_early(s);
+    receive_early_frames(s);
 }
 
 /* ---- the own frame ---- */
 
-/* The frame that lies ready, unless it would disturb the next turn. */
-static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
+/* Writes the datagram of the ready frame; too late in the slot, it would disturb the next turn and is
+ * dropped. -> its length, 0: none. */
+static int send_frame(dtsa_station *s, int64_t now, uint8_t *datagram)
 {
     const int64_t late = now - dtsa_station_slot_start(s, s->slot);
     if (late > s->latest_send_ns) {
@@ -283,9 +288,9 @@ static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
     return s->datagram_length;
 }
 
-void dtsa_station_sent(dtsa_station *s, int64_t now, int taken)
+void dtsa_station_sent(dtsa_station *s, int64_t now, int accepted)
 {
-    if (taken) {
+    if (accepted) {
         s->refused_since = INT64_MIN;
         return;
     }
@@ -311,9 +316,10 @@ static dtsa_verdict refuse(dtsa_station *s, dtsa_verdict verdict, const uint8_t 
     return verdict;
 }
 
-/* A datagram with the own id: an echo or a replay of an own one, or another agent of that id. */
-static dtsa_verdict hear_own_id(dtsa_station *s, const uint8_t *data, long length, int64_t arrival,
-                                int64_t apart)
+/* A datagram with the own id is an echo or a replay of an own one, or comes from another agent with
+ * that id. apart: from the own slot times, ns. */
+static dtsa_verdict classify_own_id(dtsa_station *s, const uint8_t *data, long length,
+                                    int64_t arrival, int64_t apart)
 {
     const uint64_t hash = datagram_hash(HASH_START, data, length);
     for (int i = 0; i < SENT_HISTORY_LENGTH; i++)
@@ -324,8 +330,9 @@ static dtsa_verdict hear_own_id(dtsa_station *s, const uint8_t *data, long lengt
     return DTSA_SAME_ID;
 }
 
-static void keep_early(dtsa_station *s, int sender, int64_t slot, const uint8_t *data,
-                       int64_t arrival)
+/* Stores a frame of a slot that has not begun. */
+static void store_early_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t *data,
+                              int64_t arrival)
 {
     if (s->early_count == s->settings.early_count) {
         refuse(s, DTSA_TOO_EARLY, data, s->datagram_length, arrival);
@@ -338,7 +345,8 @@ static void keep_early(dtsa_station *s, int sender, int64_t slot, const uint8_t 
     memcpy(e->datagram, data, (size_t)s->datagram_length);
 }
 
-static void note_offset(dtsa_station *s, int64_t off)
+/* Counts a frame that is near the own slot times, and whether it is off by more than a quarter slot. */
+static void count_offset(dtsa_station *s, int64_t off)
 {
     enum { NEAR_SLOTS = 8 };
     if (off < 0) off = -off;
@@ -362,13 +370,13 @@ dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long len
     peer *p = &s->peers[d.sender - 1];
     if (d.sender == c->id) {
         verdict =
-            listens ? DTSA_OTHER_TIME : hear_own_id(s, data, length, arrival, start - expected);
+            listens ? DTSA_OTHER_TIME : classify_own_id(s, data, length, arrival, start - expected);
         return refuse(s, verdict, data, length, arrival);
     }
     if (p->last_slot == d.slot && !listens) return refuse(s, DTSA_REPEATED, data, length, arrival);
     p->last_slot = d.slot;
     s->heard_ns = arrival;
-    note_offset(s, start - expected);
+    count_offset(s, start - expected);
     const int outcome = clock_hear(s, d.sender - 1, start - slot * c->slot_ns, arrival);
     if (outcome == OTHER) return refuse(s, DTSA_OTHER_TIME, data, length, arrival);
     if (outcome == RESTARTED) {
@@ -382,16 +390,16 @@ dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long len
     }
     contacts_hear(s, &d);
     if (slot > s->slot)
-        keep_early(s, d.sender, slot, data, arrival);
+        store_early_frame(s, d.sender, slot, data, arrival);
     else if (slot >= s->first - 1)
-        hear_frame(s, d.sender, slot, data, arrival);
+        receive_frame(s, d.sender, slot, data, arrival);
     return DTSA_ACCEPTED;
 }
 
 /* ---- what is due ---- */
 
-/* When something is due: in the past, at once. An agent that waits for a frame looks when it could
- * decide, and once more when it has to. */
+/* When the next step is due; in the past: at once. An agent that waits for a frame is due when it could
+ * decide, and again when it has to. */
 static int64_t due_ns(const dtsa_station *s, int64_t now)
 {
     if (s->state == DTSA_LISTENING) return s->deadline_ns;
@@ -406,13 +414,13 @@ int64_t dtsa_station_step(dtsa_station *s, int64_t now, uint8_t *datagram, int *
     const int64_t due = due_ns(s, now);
     if (now < due) return due;
     if (s->state == DTSA_LISTENING) {
-        /* Not slot 0: that is for agents that are told to begin together. */
+        /* Not in slot 0: there agents begin together, if the settings say so. */
         s->origin_ns = s->settings.begins ? s->settings.origin_ns : now - s->round_ns;
         s->state = DTSA_ALONE;
         s->in_step_ns = now;
         restart(s, now);
     } else if (s->frame_length) {
-        *length = send(s, now, datagram);
+        *length = send_frame(s, now, datagram);
     } else if (now - dtsa_station_slot_start(s, s->slot + 1) > s->too_long_ns) {
         restart(s, now);
     } else {
@@ -434,7 +442,7 @@ int dtsa_station_awaits_frame(const dtsa_station *s, int64_t now)
 
 int64_t dtsa_station_longest_gap(dtsa_station *s, int *agent)
 {
-    for (int k = 0; k < s->settings.agents; k++) note_gap(s, k, s->slot);
+    for (int k = 0; k < s->settings.agents; k++) update_longest_gap(s, k, s->slot);
     *agent = s->longest_of;
     return s->longest_gap;
 }
@@ -453,7 +461,7 @@ void dtsa_station_get_status(const dtsa_station *s, dtsa_station_status *status)
                           : clock_in_step(s, s->origin_ns + s->slot * s->settings.slot_ns);
 }
 
-/* ---- an agent of libdtsa behind it ---- */
+/* ---- the station of an agent of libdtsa ---- */
 
 static int agent_open(void *context, int64_t slot, int hovers, uint8_t frame[DTSA_DATAGRAM_MAX],
                       int *chosen)

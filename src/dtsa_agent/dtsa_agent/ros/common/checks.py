@@ -120,7 +120,7 @@ def check_slot(message: Any, agents: int) -> None:
         return
     if count == 0:
         if len(lengths) or len(message.data) or len(received):
-            raise BadMessage(SIZES, "slot message with frames of nobody")
+            raise BadMessage(SIZES, "slot message with frames of no agent")
         return
     if len(lengths) != count or len(received) != count * ((agents + 7) // 8):
         detail = f"{count} senders, {len(lengths)} lengths, {len(received)} bytes of receivers"

@@ -76,4 +76,4 @@ def agent_names(ids: Iterable[int]) -> str:
     """Return agents as the user knows them: ``cf3``, or ``cf1 .. cf6`` for many in a row."""
     rows = [list(group) for _, group in groupby(enumerate(sorted(ids)), lambda item: item[1] - item[0])]
     ends = [(row[0][1], row[-1][1]) for row in rows]
-    return ", ".join(f"cf{a}" if a == b else f"cf{a} .. cf{b}" for a, b in ends) or "nobody"
+    return ", ".join(f"cf{a}" if a == b else f"cf{a} .. cf{b}" for a, b in ends) or "no agent"

@@ -192,7 +192,7 @@ def fly_crazyflies(
     check_slotted(run.swarm.policy)
     require_cflib()
     scenario = check_places(settings, run.swarm)
-    shared = attach or settings.station.positions.on
+    shared = attach or settings.station.positions.enabled
     wanted = options.domain
     if wanted is None and shared:  # that of the bridge, or of motion capture
         wanted = whole_number(os.environ.get("ROS_DOMAIN_ID") or "0", "ROS_DOMAIN_ID", 0, LAST_DOMAIN)

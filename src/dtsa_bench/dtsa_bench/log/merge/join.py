@@ -131,7 +131,7 @@ def receptions_of(log: FlightArrays) -> list[tuple[NDArray[np.bool_], NDArray[np
     heard_by: dict[tuple[int, int], NDArray[np.bool_]] = {}  # by slot and sender
     for part in log.parts:
         if part.heard is not None:
-            for slot, sender, by in zip(part.heard.slot.tolist(), part.heard.sender.tolist(), part.heard.by, strict=True):
+            for slot, sender, by in zip(part.heard.slot.tolist(), part.heard.sender.tolist(), part.heard.receivers, strict=True):
                 before = heard_by.get((slot, sender))
                 heard_by[slot, sender] = by if before is None else before | by
     found = []

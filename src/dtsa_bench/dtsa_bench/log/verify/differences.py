@@ -21,7 +21,7 @@ WHY = {
     "received": "the channel's draw from its seed for this slot",
     "lost": "the channel's draw from its seed for this slot",
     "collided": "two frames in one slot destroy each other",
-    "outcome": "who sent decides",
+    "outcome": "the number of senders decides",
     "chosen": "what the policy gives from what the agent heard",
     "reason": "what the policy gives from what the agent heard",
     "digest": "the agent's table after all that it heard",

@@ -33,13 +33,13 @@ def check_merged(log: FlightArrays, result: Result) -> None:
         raise decision_difference(first, log, "follows from what the agent says to have heard")
     result.count("decisions made again", replay.equal)
     if others := about["frames_heard_not_as_sent"] + count_unmatched_frames(log):
-        why = "nobody hears what was not sent"
+        why = "no agent hears a frame that was not sent"
         raise Mismatch(Difference("frames heard", "as they were sent", f"{others} others", why))
     if apart := about["not_determined"]:
         raise Mismatch(Difference("time line", "one of all agents", f"{len(apart)} groups", clocks_apart(apart)))
     rules = check_rules(log, replay.unsent)
     if about["missing"] or about["broken_off"] or about["nothing_written"]:
-        result.skipped["turns"] = "bags are missing or break off: who was given a turn is not known of all"
+        result.skipped["turns"] = "bags are missing or break off: it is not known to which agents all turns were given"
     elif rules.broken:
         why = "all bags are there and whole"
         raise Mismatch(Difference("frames in turn", "no rule broken", "; ".join(rules.broken), why))

@@ -121,7 +121,7 @@ class FramesOnAir:
         for sent in self._sent.values():
             received, lost, collided = sent.verdict
             if received[sent.sender - 1]:
-                why = "nobody hears itself"
+                why = "no agent hears itself"
                 raise Mismatch(Difference("received", "others only", f"cf{sent.sender}", why, sent.slot, sent.sender))
             if int(received.sum()) + lost + collided > most:
                 why = "each counts once"
@@ -153,7 +153,7 @@ class FramesOnAir:
                 raise Mismatch(Difference("received", "one of two frames at most", both, why, other.slot, other.sender))
         if one.on_air.deafens(other.on_air) and other.received[one.sender - 1]:
             raise Mismatch(Difference("received", f"without cf{one.sender}", _ids(other.received),
-                                      "who sends does not hear", other.slot, other.sender))  # fmt: skip
+                                      "a sender does not hear", other.slot, other.sender))  # fmt: skip
 
     def check_verdicts(self, changes: Sequence[tuple[int, dict[str, Any]]], until_ns: int | None = None) -> int:
         """Make all verdicts again from the frames, their times and the channel's seed; returns how many.
@@ -220,12 +220,12 @@ class FramesOnAir:
         taken_in: dict[tuple[int, int], Mask] = {}
         delays, count = Delays(self.config.agents), 0
         for k, (slot, sender) in enumerate(zip(heard.slot.tolist(), heard.sender.tolist(), strict=True)):
-            sent, by = self._sent.get((slot, sender)), heard.by[k]
+            sent, by = self._sent.get((slot, sender)), heard.receivers[k]
             if sent is None:
                 if slot >= slots:
                     continue
                 raise Mismatch(Difference("heard_sender", "a frame that was sent", f"cf{sender}",
-                                          "nobody hears what was not sent", slot))  # fmt: skip
+                                          "no agent hears a frame that was not sent", slot))  # fmt: skip
             before = taken_in.setdefault((slot, sender), np.zeros(self.config.agents, np.bool_))
             wrong = np.flatnonzero(by & (before | ~sent.received))
             if len(wrong):
@@ -236,7 +236,7 @@ class FramesOnAir:
             delay = int(heard.time_ns[k]) - sent.arrival_ns
             if delay < 0:
                 raise Mismatch(Difference("heard_ns", f"at least {sent.arrival_ns} ns", f"{heard.time_ns[k]} ns",
-                                          "nobody hears a frame before it has arrived", slot, sender))  # fmt: skip
+                                          "no agent hears a frame before it has arrived", slot, sender))  # fmt: skip
             receivers = np.flatnonzero(by)
             delays.add_many(np.full(len(receivers), delay), receivers)
             count += len(receivers)

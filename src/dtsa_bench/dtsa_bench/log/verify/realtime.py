@@ -49,7 +49,7 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
     result.count("slot records", len(log))
     _check_outcomes(log)
     frames.check_numbers()
-    result.count("frames that nobody heard together with another", frames.check_overlaps())
+    result.count("frames that no agent heard together with another", frames.check_overlaps())
     summary = _check_summary(log, result)
     if own_clocks and (run.air.range_m or run.air.capture_db):
         result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"

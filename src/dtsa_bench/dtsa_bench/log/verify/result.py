@@ -92,11 +92,11 @@ class Result:
         if not rules.has_rules:
             return
         if rules.broken:
-            why = "a turn is its owner's, or of the last one to whom it was given (docs/reference/protocol.md)"
+            why = "a turn is its owner's, or of the last agent that was given it (docs/reference/protocol.md)"
             raise Mismatch(Difference("frames", "none against the rules", "; ".join(rules.broken[:3]), why))
         self.count("slots whose frames keep to the rules", rules.slots)
         if rules.unchecked:
-            why = "they may depend on frames that were too late to be sent, and that nobody has recorded"
+            why = "they may depend on frames that were too late to be sent, and are in no record"
             self.skipped["frames against the rules"] = f"in {rules.unchecked} slots: {why}"
 
     def to_dict(self) -> dict[str, Any]:

@@ -35,7 +35,7 @@ const FIGURES = [
     return count ? [num(sum / count / 10, 1, "slots"), `${run.listener ? "here; " : ""}worst agent ${num(most / 10, 1)}`] : ["–", ""];
   }],
   [run => run.listener ? "Frames leave late" : "Channel's lag", (run, row) => {
-    if (!run.listener && run.mode !== "realtime") return ["–", "in lockstep nobody is late"];
+    if (!run.listener && run.mode !== "realtime") return ["–", "in lockstep no agent is late"];
     if (row < 0) return ["–", ""];
     const lag = run.moments.lag[row];
     return [num(lag, 1, "ms"), run.listener ? `${whole(run.moments.refused[row])} datagrams not taken in` : "", !run.listener && lag > 500 * run.slot_s ? "bad" : ""];

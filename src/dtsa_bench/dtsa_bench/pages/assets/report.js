@@ -69,7 +69,7 @@ root.append(main);
 const shared = {yaw: -0.9, pitch: 0.62, zoom: 1, paths: true, names: Math.max(...RUNS.map(run => run.agents)) <= 40, targets: true, buttons: {}, scenes: [],
   draw() { this.scenes.forEach(scene => scene.context && scene.draw(clock.time)); }};
 const crashed = RUNS.some(run => run.crashes.length), hovers = RUNS.some(run => run.moving.includes(false));
-section("Flight", `Drag to turn, wheel or pinch to zoom. Rings mark who sends: amber if it was heard, red and dotted if it collided. Small crosses are targets.${hovers ? " Who hovers is grey." : ""}${crashed ? " A cross in a ring is a crash." : ""}`,
+section("Flight", `Drag to turn, wheel or pinch to zoom. Rings mark senders: amber if it was heard, red and dotted if it collided. Small crosses are targets.${hovers ? " Hovering agents are grey." : ""}${crashed ? " A cross in a ring is a crash." : ""}`,
   {has: run => run.scene, draw: run => new Scene(run, shared).node}, "wide");
 section("Distances", "Between all pairs of agents: the smallest of all, and the pairs that came closest.", {
   has: run => run.distances,
@@ -118,7 +118,7 @@ section("Slots", "Who sent in which slot, and why. The strip on top says what be
     const names = REASONS.filter(name => RUNS.some(run => run.sent_for.includes(name)));
     onRedraw(main, () => legend.replaceChildren(...reasonLegend(names, [
       ...(names.length ? [] : [["sent", theme.color("success"), ""]]),
-      ["collision", theme.color("collision"), "two or more sent: tall in the strip"], ["idle", theme.color("idle"), "nobody sent"],
+      ["collision", theme.color("collision"), "two or more sent: tall in the strip"], ["idle", theme.color("idle"), "no agent sent"],
       ["partly lost", "linear-gradient(var(--line) 60%, var(--ink) 60%)", "paler, with an edge: some did not receive it"]])));
     return legend;
   },
@@ -134,7 +134,7 @@ section("Channel use", "What became of the slots, as shares of a short while, an
     line: run.summary.lost_fraction > 0 ? {name: "lost to noise", values: run.channel.lost, color: "lost"} : null,
   })),
 }, "half");
-section("Decisions", "Why agents took whom they took for the sender: of all agents and slots.", {
+section("Decisions", "Why agents expected the sender that they expected: of all agents and slots.", {
   has: run => run.decisions,
   draw: run => {
     const data = run.decisions;

@@ -46,7 +46,7 @@ class SlotLine {
       rows.push(`agent ${this.record.sender[i]}: ${this.record.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.record.received[i] / 255, 0)}`);
       if (why) rows.push(`  ${why}${reasonText(why) ? ": " + reasonText(why) : ""}`);
     }
-    if (rows.length === 1) rows.push(this.run.slots?.unknown?.includes(slot) ? "not known whether somebody sent" : "nobody sent");
+    if (rows.length === 1) rows.push(this.run.slots?.unknown?.includes(slot) ? "not known whether an agent sent" : "no agent sent");
     return rows.join("\n");
   }
 

@@ -6,7 +6,7 @@ import {Panels, Crazyflies} from "./panels.js";
 const MODES = {
   realtime: "real time", lockstep: "lockstep", udp: "on a network", serial: "by serial modems", crazyradio: "by Crazyradios",
 };
-const LISTENER = "As a listener on the network knows it: positions are those of the last frames, flown on until the next; ages are the listener's. Not known here: who received a frame, what the agents believe, whether they agree, and where they truly are. A slot in which nothing was heard counts as idle.";
+const LISTENER = "As a listener on the network knows it: positions are those of the last frames, flown on until the next; ages are the listener's. Not known here: receivers of a frame, what the agents believe, whether they agree, and where they truly are. A slot in which nothing was heard counts as idle.";
 const FRAME_MS = 30, SLOW_MS = 90, LAG_S = 0.12, CHARTS_MS = 1000;
 sharpness.ratio = Math.min(2, devicePixelRatio || 1);
 const root = document.getElementById("page"), main = el("main");
@@ -63,7 +63,7 @@ function makeView(run) {
     series: data.names.map((name, k) => ({name, values: data.values[k], color: colors[k], width: 1.6}))});
   const legend = el("div", {class: "reasons"});
   onRedraw(main, () => legend.replaceChildren(...reasonLegend(REASONS.filter(name => run.reasons.includes(name)),
-    [["collision", theme.color("collision"), "two or more sent"], ["idle", theme.color("idle"), "nobody sent"]])));
+    [["collision", theme.color("collision"), "two or more sent"], ["idle", theme.color("idle"), "no agent sent"]])));
   const node = el("div", {class: "run"}, run.listener ? el("p", {class: "what listener"}, LISTENER) : null, panels.figures,
     el("div", {class: "stagebox"}, el("div", {class: "stagecolumn"}, el("section", {class: "flight"}, new Scene(run, scene).node), panels.control), el("div", {class: "side"}, panels.agents, panels.events)),
     el("section", {}, el("h2", {}, "Slots"), el("p", {class: "what"}, "Who sends in which slot, and why. The strip on top says what becomes of each slot. Click to go there."), strip.node, legend),

@@ -107,7 +107,7 @@ def demo_steps(seed: int) -> tuple[tuple[DemoFlight, ...], ...]:
         (
             lockstep("two-tdma", "TDMA", "everybody in turn", "tdma", 2),
             lockstep("two-dtsa", "DTSA", "whose state is most urgent", "dtsa", 2),
-            lockstep("two-lease", "lease", "who hovers lends its turns", "lease", 2),
+            lockstep("two-lease", "lease", "hovering agents lease their turns", "lease", 2),
         ),
         (
             lockstep("loss-tdma", "TDMA", "everybody in turn", "tdma", 4, loss=LOSS),

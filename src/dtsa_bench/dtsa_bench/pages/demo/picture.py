@@ -131,7 +131,7 @@ def step_text(number: int, flights: Flights) -> tuple[str, str]:
         return (
             "Lose one message in ten, and DTSA falls apart.",
             "DTSA works as long as all know the same. After the first lost message they do not: all agree in "
-            f"{flights['loss-dtsa'].agreement} of the slots, {at_once['loss-dtsa']} or nobody does, positions are "
+            f"{flights['loss-dtsa'].agreement} of the slots, {at_once['loss-dtsa']} or none does, positions are "
             f"wrong by {error['loss-dtsa']}. With lease only whose turn it is gives it away, in its own message: "
             f"{at_once['loss-lease']}, {error['loss-lease']}. Round robin does not mind losses, but is slow: "
             f"{error['loss-tdma']}.",
@@ -190,8 +190,8 @@ def _draw_strips(sheet: _Sheet, top: float, step: Sequence[FinishedFlight], head
     axes.set_xlabel("slot (10 ms each)", fontsize=7, color=QUIET, labelpad=1)
     keys = [(agent_colour(5), "none", "sent by one that flies"), (HOVER, "none", "sent by one that hovers")]
     if any(len(senders) > 1 for finished in step for senders in finished.senders[first : first + COUNT]):
-        keys.append((agent_colour(4), COLLIDED, "two or more at once: nobody understands them"))
-    keys.append(("white", HOVER, "nobody sends"))
+        keys.append((agent_colour(4), COLLIDED, "two or more at once: no receiver understands them"))
+    keys.append(("white", HOVER, "no agent sends"))
     handles = [Rectangle((0, 0), 1, 1, facecolor=face, edgecolor=edge, label=text) for face, edge, text in keys]
     sheet.figure.legend(
         handles=handles, loc="upper left", bbox_to_anchor=(1.9 / WIDTH, 1 - (top + 1.5) / sheet.height), ncols=4,
@@ -282,7 +282,7 @@ def draw_animation(path: Path, flights: Flights, slots: int = 80) -> None:
     rows = (
         ("two-tdma", "TDMA", "All speak in turn, also the ten that hover and have nothing new to say."),
         ("two-dtsa", "DTSA", "All compute whose state is most urgent: the two that fly speak."),
-        ("loss-dtsa", "DTSA, 1 message in 10 lost", "They no longer know the same: two speak at once, or nobody."),
+        ("loss-dtsa", "DTSA, 1 message in 10 lost", "They no longer know the same: two send at once, or none."),
         ("loss-lease", "lease, 1 message in 10 lost", "Who hovers lends its turns, so only one can speak."),
     )
     across, row_height = 40, 1.42
@@ -290,7 +290,7 @@ def draw_animation(path: Path, flights: Flights, slots: int = 80) -> None:
         sheet = _Sheet(6.34, 8.8, dpi=100)
         sheet.text(0.14, 0.14, "Twelve quadcopters, one radio channel: who speaks next?", 13, fontweight="bold")
         reading = (
-            "A cell is a slot of 10 ms, its number says who sends in it. Grey: that one hovers. White: nobody sends."
+            "A cell is a slot of 10 ms, its number says who sends in it. Grey: that one hovers. White: no agent sends."
         )
         sheet.text(0.14, 0.42, reading, 8.7, color=QUIET)
         drawn = []

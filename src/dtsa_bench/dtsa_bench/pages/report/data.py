@@ -47,7 +47,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
     if told and not any(note.startswith(told.partition(":")[0]) for note in notes):
         notes.append(told)
     if unknown := int((run.recorded & ~run.outcome_known).sum()):
-        notes.append(f"Of {unknown} slots it is not known whether somebody sent: not all agents have told of them.")
+        notes.append(f"Of {unknown} slots it is not known whether an agent sent: not all agents have reported them.")
     summary = followed.summary | _counts(run)
     if distances is not None and summary.get("min_distance_m") is None and len(distances.least):
         summary["min_distance_m"] = float(np.nanmin(distances.least))

@@ -179,7 +179,7 @@ class NetworkListener:
 
     def run(self) -> None:
         """Listen until ``stopped`` is set."""
-        self._history.state = f"waiting for frames: {self._port.where}"
+        self._history.state = f"waiting for frames: {self._port.destination}"
         with self._listener:
             while not self.stopped:
                 select.select([self._listener], [], [], _POLL_S)

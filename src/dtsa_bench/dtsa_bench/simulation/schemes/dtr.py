@@ -61,7 +61,9 @@ class Dtr:
         if self._packet is not None and now_ns >= self._due_ns:
             kind, target = self._packet
             sent = (
-                radio.send(self._note(kind, target), target) if kind == _DATA else radio.say(self._note(kind, target))
+                radio.send(self._note(kind, target), target)
+                if kind == _DATA
+                else radio.send_note(self._note(kind, target))
             )
             self._due_ns = now_ns + (self._resend_ns if sent else _RETRY_NS)
             if sent and self._state == _IDLE:

@@ -99,7 +99,7 @@ class Mixer:
             self._news = False
             for agent, frame in sorted(self._heard.solved().items()):
                 if agent != self._agent:
-                    radio.take_in(frame.to_bytes(self._length, "little"), self._round * self._period_slots)
+                    radio.receive_frame(frame.to_bytes(self._length, "little"), self._round * self._period_slots)
         if now_ns >= self._due_ns:
             self._act(radio)
         return max(now_ns + 1, self._due_ns)
@@ -123,7 +123,7 @@ class Mixer:
             self._heard.add(1 << (self._agent - 1), int.from_bytes(radio.frame(), "little"))
         slot = since_ns // self.slot_ns
         if since_ns < self.round_ns and slot % self._count == self._agent - 1:
-            radio.say(self._mix())
+            radio.send_note(self._mix())
         own = slot + 1 + (self._agent - 2 - slot) % self._count
         ends_ns = [own * self.slot_ns, self.round_ns] if since_ns < self.round_ns else []
         self._due_ns = number * self.period_ns + min([*ends_ns, self.period_ns])

@@ -93,7 +93,7 @@ class Sotdma:
         away = ((table.sent_position[:, owners] - own) ** 2).sum(axis=0)
         return slots[int(away.argmax())]
 
-    def say(self, table: Table, slot: int) -> bytes:
+    def own_data(self, table: Table, slot: int) -> bytes:
         """Frames left, and the offset to the next report."""
         if self._left:
             self._offset = self._frame
@@ -101,7 +101,7 @@ class Sotdma:
             self._offset = self._draw(table, slot + self._frame, slot) - slot
         return bytes((self._left, *self._offset.to_bytes(2, "little")))
 
-    def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
+    def receive_data(self, table: Table, slot: int, sender: int, data: bytes) -> None:
         """Notes when the sender comes again, as far as it has said."""
         left, offset = data[0], int.from_bytes(data[1:], "little")
         if not 1 <= offset <= 2 * self._frame or left >= _TIMEOUTS[1]:

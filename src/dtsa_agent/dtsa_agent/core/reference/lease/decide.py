@@ -22,7 +22,7 @@ def decide(memory: Memory, self_index: int, slot: int, far_from_goal: bool) -> C
     owner = memory.owner(slot)
     lease = memory.leases.get(slot)
     if lease is not None and lease.lessee == OPEN:
-        return Choice(self_index if takes_open(memory, self_index, slot) else -1, "open")
+        return Choice(self_index if uses_open_turn(memory, self_index, slot) else -1, "open")
     if lease is not None:
         adopted = lease.issuer not in (0, owner + 1, HANDED)
         memory.expected = lease.lessee - 1
@@ -52,7 +52,7 @@ def watch_goal(memory: Memory, slot: int, far_from_goal: bool) -> None:
     memory.moving = far_from_goal
 
 
-def own_right_is_near(memory: Memory, self_index: int, slot: int) -> bool:
+def has_own_turn_soon(memory: Memory, self_index: int, slot: int) -> bool:
     """Whether the agent may send by a right of its own within the next N / 2 slots."""
     for turn in range(slot + 1, slot + memory.rules.agents // 2 + 1):
         lease = memory.leases.get(turn)
@@ -63,13 +63,13 @@ def own_right_is_near(memory: Memory, self_index: int, slot: int) -> bool:
     return False
 
 
-def takes_open(memory: Memory, self_index: int, slot: int) -> bool:
+def uses_open_turn(memory: Memory, self_index: int, slot: int) -> bool:
     """Whether a waking agent uses an OPEN turn: with the chance 1 / ((1 + 3 w) 2^a), a at most 5.
 
     w agents woke lately; a frames of its own in OPEN turns were not known to be heard. So many that woke together get
     out of each other's way.
     """
-    if memory.woke == NEVER or own_right_is_near(memory, self_index, slot):
+    if memory.woke == NEVER or has_own_turn_soon(memory, self_index, slot):
         return False
     chance = 1.0 / ((1.0 + 3.0 * memory.wakers) * 2.0 ** min(memory.attempts, 5))
     draw = mix64(memory.rules.key ^ mix64((slot << 16) + self_index + _OPEN_DRAW))

@@ -177,7 +177,7 @@ static void watch_goal(const dtsa_agent *agent, lease_scope *v, int64_t slot)
     a->moving = (uint8_t)moving;
 }
 
-static int own_right_is_near(const lease_scope *v, int self, int64_t slot)
+static int has_own_turn_soon(const lease_scope *v, int self, int64_t slot)
 {
     for (int64_t t = slot + 1; t <= slot + v->n / 2; t++) {
         const int given = v->lessee[t % v->window];
@@ -192,10 +192,10 @@ static int own_right_is_near(const lease_scope *v, int self, int64_t slot)
  * that falls with the number of agents that wake in these days; without an answer (a gossip entry
  * of mine in the frames that follow) the chance halves each time, so that many who woke together
  * get out of each other's way. */
-static int takes_open(const dtsa_agent *agent, const lease_scope *v, int64_t slot)
+static int uses_open_turn(const dtsa_agent *agent, const lease_scope *v, int64_t slot)
 {
     const int self = agent->self;
-    if (v->a->woke < 0 || own_right_is_near(v, self, slot)) return 0;
+    if (v->a->woke < 0 || has_own_turn_soon(v, self, slot)) return 0;
     const int halvings = v->a->attempts < 5 ? v->a->attempts : 5;
     const double chance = 1.0 / ((1.0 + 3.0 * v->a->wakers) * (double)(1 << halvings));
     const uint64_t what = ((uint64_t)slot << 16) + (uint64_t)self + 0x4f50454eULL;
@@ -236,7 +236,7 @@ static choice lease_decide(dtsa_agent *agent, int64_t slot)
     const int given = v.lessee[slot % v.window], issuer = v.issuer[slot % v.window];
     if (given == LEASE_NONE) return decide_unleased(self, &v, slot);
     if (given == LEASE_OPEN)
-        return expect(takes_open(agent, &v, slot) ? self : -1, DTSA_REASON_LEASE_OPEN);
+        return expect(uses_open_turn(agent, &v, slot) ? self : -1, DTSA_REASON_LEASE_OPEN);
     a->expected = given - 1;
     const int adopted = issuer && issuer != LEASE_HANDED && issuer != (int)(slot % v.n) + 1;
     const int reason = adopted ? DTSA_REASON_LEASE_ADOPTED : DTSA_REASON_LEASE_LEASED;
@@ -246,7 +246,7 @@ static choice lease_decide(dtsa_agent *agent, int64_t slot)
 
 /* ---- what was heard ---- */
 
-static void judge_claim(const dtsa_agent *agent, lease_scope *v, int64_t slot,
+static void check_claim(const dtsa_agent *agent, lease_scope *v, int64_t slot,
                         const extended_frame *e, int was_absent)
 {
     lease_agent *a = v->a;
@@ -294,7 +294,7 @@ static void lease_listen(dtsa_agent *agent, int64_t slot, const extended_frame *
     v.miss[sender] = 0;
     v.quiet[sender] = (uint8_t)e->probation;
     v.heard[sender] = e->leaving ? GONE : slot;
-    judge_claim(agent, &v, slot, e, was_absent);
+    check_claim(agent, &v, slot, e, was_absent);
     v.resting[sender] = !e->own.c_r;
     hear_gossip(agent, &v, slot, e);
     if (slot % v.n == sender) v.settled[sender] = 0;
