@@ -67,7 +67,7 @@ The first Ctrl-C lands all, the second stops all motors."""
         use_simulated_radio(args)
         settings = load_swarm(args.config)
         if args.check is not None:
-            print("\n".join([f"{args.config}: {len(settings.robots)} Crazyflies", *settings.summary()]), flush=True)
+            print("\n".join([f"{args.config}: {len(settings.robots)} Crazyflies", *settings.describe()]), flush=True)
             for line in place_lines(settings):
                 print(f"for a mission: {line}", flush=True)
         if args.check == FILE:
