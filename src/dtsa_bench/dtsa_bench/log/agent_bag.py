@@ -33,7 +33,7 @@ from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench.log.arrays import NEW
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
-from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, checksum_fault, register_type
+from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, checksum_fault, register_type, shared_typestore
 from dtsa_bench.log.bag.recover import RecordScan
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
 from dtsa_bench.log.record import (
@@ -292,7 +292,10 @@ class _Reader:
         if isinstance(record, Channel) and record.topic == SLOT_RECORD:
             self._channel = record.id
         elif isinstance(record, Schema) and record.name == TYPE:
-            register_type(self._store, TYPE, record.data.decode())
+            definition = record.data.decode()
+            self._store = shared_typestore(frozenset({(TYPE, definition)}))
+            if TYPE not in self._store.fielddefs:
+                register_type(self._store, TYPE, definition)
         elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
             custom = metadata.custom_data(metadata.load_record(record))
             self._custom |= custom if AGENT in custom else {}

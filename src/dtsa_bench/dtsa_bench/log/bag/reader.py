@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -116,7 +116,8 @@ class Bag:
         self.end_ns: int = max(part.message_end_time for part in statistics)
         records = self._records()
         self._has_packed_messages = any(map(metadata.has_packed_messages, records))
-        self.typestore = get_typestore(Stores.EMPTY)  # of the types that were decoded
+        # Of the types that were decoded.
+        self.typestore = shared_typestore(frozenset((topic.type, topic.definition) for topic in self.topics.values()))
         #: The recorder's own texts; empty in a foreign bag.
         self.custom_data = next(filter(None, map(metadata.custom_data, records)), {})
 
@@ -264,6 +265,12 @@ class Bag:
 
     def __exit__(self, *unused: object) -> None:
         self.close()
+
+
+@lru_cache(maxsize=16)
+def shared_typestore(definitions: frozenset[tuple[str, str]]) -> Typestore:
+    """The types of bags with these definitions, empty at first: to compile them takes longer than to read a bag."""
+    return get_typestore(Stores.EMPTY)
 
 
 def register_type(store: Typestore, kind: str, definition: str) -> None:
