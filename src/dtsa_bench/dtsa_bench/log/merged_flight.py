@@ -110,25 +110,26 @@ class MergedSlot:
 class _Process:
     """A process of an agent, between the first and the last slot that it recorded."""
 
-    def __init__(self, config: SwarmConfig, about: Mapping[str, Any]) -> None:
+    def __init__(self, config: SwarmConfig, about: Mapping[str, Any], compares: bool) -> None:
         self.agent, self.first, self.last = (int(about[name]) for name in ("agent", "first", "last"))
         self.has_ended, self.is_broken_off = bool(about["ended_in_order"]), bool(about["broken_off"])
         if not 1 <= self.agent <= config.agents:
             raise ValueError(f"agent {self.agent}")
-        self.replay = AgentReplay(config, [self.agent], goals_told=bool(about["goals_told"]))
+        self.replay = AgentReplay(config, [self.agent], goals_told=bool(about["goals_told"]), compares=compares)
 
 
 class MergedReplay:
     """All agents of a merged flight; iterating replays them, and gives the slots from the common one on.
 
+    :param compares: what they decide with the log; otherwise only what they know is followed.
     :raises UnusableBag: if what the log was merged from does not fit it.
     """
 
-    def __init__(self, log: FlightArrays) -> None:
+    def __init__(self, log: FlightArrays, compares: bool = True) -> None:
         assert log.merged is not None
         self._log, self._config = log, log.config.swarm
         try:
-            self.processes = [_Process(self._config, about) for about in log.merged["processes"]]
+            self.processes = [_Process(self._config, about, compares) for about in log.merged["processes"]]
         except (KeyError, ValueError, TypeError) as error:
             raise UnusableBag(log.file or log.name, f"its records do not fit together ({error})") from None
         #: The results from when all can have become known, (M + 2) N slots after the common one, and from when no agent
@@ -323,7 +324,7 @@ def _recorded_frames(log: FlightArrays) -> Iterator[tuple[tuple[int, int], bytes
 # -- what the agents knew --------------------------------------------------------------------------------------------
 def follow_merged(log: FlightArrays) -> tuple[MeanAges, dict[str, Any], list[str]]:
     """What the agents of a merged flight knew, and its results, by replaying all of them."""
-    ages, replay = MeanAges.empty(len(log), log.agents), MergedReplay(log)
+    ages, replay = MeanAges.empty(len(log), log.agents), MergedReplay(log, compares=False)
     for slot in replay:
         counted, age, error = slot.pairs()
         ages.results[slot.row] = slot.results
@@ -333,7 +334,7 @@ def follow_merged(log: FlightArrays) -> tuple[MeanAges, dict[str, Any], list[str
 
 def observed_merged(log: FlightArrays) -> Iterator[ObservedPairs]:
     """What each observer of a merged flight knew, slot by slot; only those of which there is a record."""
-    for slot in MergedReplay(log):
+    for slot in MergedReplay(log, compares=False):
         tables = slot.tables
         expected, age, error = slot.pairs()
         known = (tables.sent_slot >= 0) & log.known[slot.row][tables.observer][:, None]
