@@ -6,20 +6,25 @@ the slot in which they arrive.
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Swarm
-from dtsa_agent.core.errors import PluginError
+from dtsa_agent.core.errors import PluginError, shown
 from dtsa_agent.core.plugins.entry_points import PluginSwarm
 from dtsa_agent.core.plugins.guard import Guarded
 from dtsa_channel_sim import Channel
-from dtsa_channel_sim.model.air import NEVER, Air, ListeningRadios, whole_ns
+from dtsa_channel_sim.model.air import NEVER, Air
+from dtsa_channel_sim.model.medium import Positions
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
+
+_MOST_LISTENS = 10_000  # for one frame
 
 
 @dataclass(slots=True)
@@ -41,6 +46,70 @@ class _Packet(NamedTuple):
     frame: bytes
     note: bytes = b""
     to: int = 0  # id of the one agent that takes the frame in; 0: all
+
+
+class ListeningRadios:
+    """Radios that listen before they send: each holds one frame until its policy's ``sensed`` says that it may begin.
+
+    The medium says whether the air is in use where a radio is: range, hidden senders, the turn-round to sending.
+
+    :param air: the air; the caller puts on it what begins.
+    :param rules: the policy of each radio, (N,).
+    """
+
+    def __init__(self, air: Air[Any], rules: Sequence[Guarded]) -> None:
+        self._air, self._rules = air, rules
+        self._held: dict[int, list[int]] = {}  # by id: number of the radio's next event, and how often it has listened
+        self._events: list[tuple[int, int, int]] = []  # heap: ns, id, number
+        self._count = 0
+        self._sent_ns = [0] * len(rules)  # when each began its last frame
+
+    def holds(self, agent: int) -> bool:
+        """Return whether a radio holds a frame that has not begun."""
+        return agent in self._held
+
+    def hand_over(self, agent: int, at_ns: int) -> None:
+        """Give a radio a frame in place of one that it holds; it listens first at ``at_ns``."""
+        self._held[agent] = [0, 0]
+        self._listen_at(agent, at_ns)
+
+    def drop(self, agent: int) -> None:
+        """Take the frame from a radio, if it holds one."""
+        self._held.pop(agent, None)
+
+    @property
+    def next(self) -> tuple[int, int]:
+        """When which radio listens next: ns, id."""
+        events = self._events
+        while events and ((held := self._held.get(events[0][1])) is None or held[0] != events[0][2]):
+            heappop(events)
+        return events[0][:2] if events else (NEVER, 0)
+
+    def listen(self, positions: Positions | None = None) -> tuple[int, int] | None:
+        """Let the next radio listen; return (ns, id) if it begins to send, None if it waits.
+
+        :raises PluginError: if the policy's answer cannot be, or lets the radio listen without end.
+        """
+        now_ns, agent = self.next
+        held, rule = self._held[agent], self._rules[agent - 1]
+        busy = self._air.busy(agent, now_ns, positions)
+        answer = rule.sensed(busy, now_ns, self._sent_ns[agent - 1])
+        allowed = "whole numbers from 1, as the air is in use" if busy else "whole numbers from 0"
+        wait_ns = _whole_ns(rule, answer, "sensed", int(busy), allowed)
+        if not wait_ns:
+            del self._held[agent]
+            self._sent_ns[agent - 1] = now_ns
+            return now_ns, agent
+        held[1] += 1
+        if held[1] >= _MOST_LISTENS:
+            raise PluginError(f"{rule.name}, sensed", f"listened {_MOST_LISTENS} times for one frame")
+        self._listen_at(agent, now_ns + wait_ns)
+        return None
+
+    def _listen_at(self, agent: int, at_ns: int) -> None:
+        self._count += 1
+        self._held[agent][0] = self._count
+        heappush(self._events, (at_ns, agent, self._count))
 
 
 class UnslottedTraffic:
@@ -267,4 +336,18 @@ def _next_wake(policy: Guarded, answer: object, now_ns: int, method: str = "wake
 
     :raises PluginError: if it is no later time.
     """
-    return whole_ns(policy, answer, method, now_ns + 1, f"whole numbers above {now_ns}, the present time")
+    return _whole_ns(policy, answer, method, now_ns + 1, f"whole numbers above {now_ns}, the present time")
+
+
+def _whole_ns(policy: Guarded, answer: object, method: str, least: int, allowed: str) -> int:
+    """Return the number of ns that a policy has answered.
+
+    :raises PluginError: if it is none, or smaller than ``least``.
+    """
+    try:
+        number = operator.index(answer)  # type: ignore[arg-type]
+    except Exception:  # whatever its __index__ raises
+        number = least - 1
+    if number < least:
+        raise PluginError(f"{policy.name}, {method}", f"gave {shown(answer)} ns; allowed: {allowed}")
+    return number

@@ -6,16 +6,15 @@ several processes, as long as each arrives before the time line is resolved past
 
 from __future__ import annotations
 
-import operator
 from collections import deque
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from dtsa_agent.core.errors import LocalProtocolError, PluginError, shown
+from dtsa_agent.core.errors import LocalProtocolError
 
 from .airtime import Airtime
 from .config import ChannelConfig
@@ -24,7 +23,6 @@ from .medium import Mask, Medium, OnAir, Positions
 Key = TypeVar("Key", bound=Hashable)
 
 NEVER = 2**63  # ns
-_MOST_LISTENS = 10_000  # for one frame
 
 
 class Media(Protocol):
@@ -262,92 +260,3 @@ class Air(Generic[Key]):
         return FrameVerdict(
             frame_id, frame.sender, slot, frame.start_ns, frame.end_ns, arrival_ns, received, lost, collided
         )
-
-
-class ListeningRule(Protocol):
-    """When a radio that listens may begin: a policy."""
-
-    @property
-    def name(self) -> str:
-        """What errors call it."""
-
-    def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> Any:
-        """Return 0 to begin now, or after how many ns to listen again; ``sent_ns``: when the last frame began."""
-
-
-class ListeningRadios:
-    """Radios that listen before they send: each holds one frame until its policy's ``sensed`` says that it may begin.
-
-    The medium says whether the air is in use where a radio is: range, hidden senders, the turn-round to sending.
-
-    :param air: the air; the caller puts on it what begins.
-    :param rules: the policy of each radio, (N,).
-    """
-
-    def __init__(self, air: Air[Any], rules: Sequence[ListeningRule]) -> None:
-        self._air, self._rules = air, rules
-        self._held: dict[int, list[int]] = {}  # by id: number of the radio's next event, and how often it has listened
-        self._events: list[tuple[int, int, int]] = []  # heap: ns, id, number
-        self._count = 0
-        self._sent_ns = [0] * len(rules)  # when each began its last frame
-
-    def holds(self, agent: int) -> bool:
-        """Return whether a radio holds a frame that has not begun."""
-        return agent in self._held
-
-    def hand_over(self, agent: int, at_ns: int) -> None:
-        """Give a radio a frame in place of one that it holds; it listens first at ``at_ns``."""
-        self._held[agent] = [0, 0]
-        self._listen_at(agent, at_ns)
-
-    def drop(self, agent: int) -> None:
-        """Take the frame from a radio, if it holds one."""
-        self._held.pop(agent, None)
-
-    @property
-    def next(self) -> tuple[int, int]:
-        """When which radio listens next: ns, id."""
-        events = self._events
-        while events and ((held := self._held.get(events[0][1])) is None or held[0] != events[0][2]):
-            heappop(events)
-        return events[0][:2] if events else (NEVER, 0)
-
-    def listen(self, positions: Positions | None = None) -> tuple[int, int] | None:
-        """Let the next radio listen; return (ns, id) if it begins to send, None if it waits.
-
-        :raises PluginError: if the policy's answer cannot be, or lets the radio listen without end.
-        """
-        now_ns, agent = self.next
-        held, rule = self._held[agent], self._rules[agent - 1]
-        busy = self._air.busy(agent, now_ns, positions)
-        answer = rule.sensed(busy, now_ns, self._sent_ns[agent - 1])
-        allowed = "whole numbers from 1, as the air is in use" if busy else "whole numbers from 0"
-        wait_ns = whole_ns(rule, answer, "sensed", int(busy), allowed)
-        if not wait_ns:
-            del self._held[agent]
-            self._sent_ns[agent - 1] = now_ns
-            return now_ns, agent
-        held[1] += 1
-        if held[1] >= _MOST_LISTENS:
-            raise PluginError(f"{rule.name}, sensed", f"listened {_MOST_LISTENS} times for one frame")
-        self._listen_at(agent, now_ns + wait_ns)
-        return None
-
-    def _listen_at(self, agent: int, at_ns: int) -> None:
-        self._count += 1
-        self._held[agent][0] = self._count
-        heappush(self._events, (at_ns, agent, self._count))
-
-
-def whole_ns(policy: ListeningRule, answer: object, method: str, least: int, allowed: str) -> int:
-    """Return the number of ns that a policy has answered.
-
-    :raises PluginError: if it is none, or smaller than ``least``.
-    """
-    try:
-        number = operator.index(answer)  # type: ignore[arg-type]
-    except Exception:  # whatever its __index__ raises
-        number = least - 1
-    if number < least:
-        raise PluginError(f"{policy.name}, {method}", f"gave {shown(answer)} ns; allowed: {allowed}")
-    return number

@@ -9,8 +9,9 @@ import pytest
 
 from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins.guard import Guarded
+from dtsa_bench.simulation.unslotted import ListeningRadios
 from dtsa_channel_sim import Air, Channel, ChannelConfig
-from dtsa_channel_sim.model.air import NEVER, ListeningRadios
+from dtsa_channel_sim.model.air import NEVER
 
 MS = 1_000_000
 LENGTH = 60
