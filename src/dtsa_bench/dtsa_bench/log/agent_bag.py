@@ -21,8 +21,7 @@ import numpy as np
 from mcap.records import Channel, Message, Metadata, Schema
 from rosbags.typesys import Stores, get_typestore
 
-from dtsa_agent.air.port import flight_ns, frame_in
-from dtsa_agent.air.port import PortProperties, PortSettings
+from dtsa_agent.air.port import PortProperties, PortSettings, flight_ns, frame_in
 from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
@@ -294,8 +293,7 @@ class _Reader:
         elif isinstance(record, Schema) and record.name == TYPE:
             definition = record.data.decode()
             self._store = shared_typestore(frozenset({(TYPE, definition)}))
-            if TYPE not in self._store.fielddefs:
-                register_type(self._store, TYPE, definition)
+            register_type(self._store, TYPE, definition)
         elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
             custom = metadata.custom_data(metadata.load_record(record))
             self._custom |= custom if AGENT in custom else {}

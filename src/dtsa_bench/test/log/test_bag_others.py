@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -51,6 +52,7 @@ def rewrite(
     keep: Callable[[Message], bool] = lambda _: True,
     more: Callable[[Writer], None] = lambda _: None,
     records: bool = True,
+    encodings: Mapping[str, str] = MappingProxyType({}),
     **options: Any,
 ) -> None:
     """Write a file again with options of another writer; without its records of metadata, as `mcap filter` does."""
@@ -68,8 +70,9 @@ def rewrite(
             if schema.id not in schemas:
                 schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
             channels[channel.id] = writer.register_channel(
-                channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
-            )
+                channel.topic, encodings.get(channel.topic, channel.message_encoding), schemas[schema.id],
+                channel.metadata,
+            )  # fmt: skip
         more(writer)
         for _, channel, message in reader.iter_messages(log_time_order=False):
             if keep(message):
@@ -152,6 +155,16 @@ def add_strange_topics(writer: Writer) -> None:
     channel = writer.register_channel("/notes", "json", writer.register_schema("Note", "jsonschema", b"{}"))
     writer.add_message(channel, 2 * SECOND, b"{}", 2 * SECOND)
     writer.add_message(writer.register_channel("/raw", "raw", 0), 2 * SECOND, b"\1\2", 2 * SECOND)
+
+
+def test_a_bag_is_read_by_its_own_definitions_whatever_was_read_before(run: SyntheticRun, tmp_path: Path) -> None:
+    path = tmp_path / "json.mcap"
+    rewrite(run.writer.path, path, encodings={"/cf1/odom": "json", "/cf2/odom": "json", "/cf3/odom": "json"})
+    for _ in range(2):
+        with Bag(run.writer.path) as bag:
+            assert len(list(bag.typed(["/cf1/odom"]))) == 40
+        with Bag(path) as bag, pytest.raises(UnusableBag, match=r"/cf1/odom.*recorded as json/ros2msg"):
+            next(bag.typed(["/cf1/odom"]))
 
 
 def test_topics_that_cannot_be_decoded_spoil_no_others(run: SyntheticRun, tmp_path: Path) -> None:

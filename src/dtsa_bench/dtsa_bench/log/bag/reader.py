@@ -117,7 +117,8 @@ class Bag:
         records = self._records()
         self._has_packed_messages = any(map(metadata.has_packed_messages, records))
         # Of the types that were decoded.
-        self.typestore = shared_typestore(frozenset((topic.type, topic.definition) for topic in self.topics.values()))
+        kinds = frozenset((topic.type, topic.definition, topic.encoding) for topic in self.topics.values())
+        self.typestore = shared_typestore(kinds)
         #: The recorder's own texts; empty in a foreign bag.
         self.custom_data = next(filter(None, map(metadata.custom_data, records)), {})
 
@@ -268,16 +269,21 @@ class Bag:
 
 
 @lru_cache(maxsize=16)
-def shared_typestore(definitions: frozenset[tuple[str, str]]) -> Typestore:
-    """The types of bags with these definitions, empty at first: to compile them takes longer than to read a bag."""
+def shared_typestore(definitions: frozenset[tuple[str, ...]]) -> Typestore:
+    """The types of bags with these definitions and encodings, empty at first: compiling them takes longer than reading.
+
+    Bags that differ in any of them share nothing: what is wrong with one says nothing of another.
+    """
     return get_typestore(Stores.EMPTY)
 
 
 def register_type(store: Typestore, kind: str, definition: str) -> None:
-    """Make a type of messages known, by the definition of it and of all that it needs.
+    """Make a type of messages known, by the definition of it and of all that it needs; not again if it is.
 
     :raises ValueError: if the definition cannot be used.
     """
+    if kind in store.fielddefs:
+        return
     try:
         types = get_types_from_msg(definition, kind)
         store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
