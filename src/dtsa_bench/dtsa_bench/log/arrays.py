@@ -21,6 +21,8 @@ from dtsa_channel_sim.model.verdict import OUTCOMES
 UNKNOWN = len(OUTCOMES)  # outcome of a slot of which not all that could have sent have told
 PRESENT, LEAVING, UNRECORDED, NEW = 1, 2, 64, 128  # presence of an agent; the last two are added
 MAX_GAPS_LISTED = 5
+DECIDED = ("chosen", "reason", "digest", "score")  # what an agent decides for a slot
+VECTORS = ("velocity", "command", "goal")  # at a slot's start
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -180,6 +182,15 @@ class FlightArrays:
         end = int(self._frame_ends[place])
         return self.data[end - int(self.length[row, sender - 1]) : end]
 
+    def frames_in(self, row: int) -> dict[int, bytes]:
+        """The frames that were sent in a slot, by the sender's id."""
+        return {column + 1: self.frame(row, column + 1) for column in np.flatnonzero(self.length[row]).tolist()}
+
+    @cached_property
+    def sent_ends(self) -> list[int]:
+        """(S + 1) where the frames of each slot begin in `sent_frames`, and the last ones end."""
+        return [0, *np.cumsum(self.sent.sum(axis=1)).tolist()]
+
     @cached_property
     def heard_ends(self) -> list[int]:
         """(S + 1) where the entries of `heard` of each slot begin, and the last ones end."""
@@ -293,7 +304,7 @@ def empty_arrays(slots: int, agents: int, steps: int, slot_ns: int) -> dict[str,
     }  # fmt: skip
     return {
         **{name: np.zeros(shape, kind) for name, kind in kinds.items()},
-        **{name: np.full(planes, np.nan) for name in ("velocity", "command", "goal")},
+        **{name: np.full(planes, np.nan) for name in VECTORS},
         "recorded": np.zeros(slots, np.bool_), "outcome": np.full(slots, UNKNOWN, np.uint8),
         "start_ns": np.arange(slots) * slot_ns, "track": np.full((slots + 1, max(1, steps), 3, agents), np.nan),
     }  # fmt: skip
@@ -318,10 +329,9 @@ def _slice(log: Log, first: int, last: int) -> Log:
         if isinstance(values, np.ndarray) and name not in ("received", "track"):
             fields[name] = values[first:last]
     ends = np.concatenate(([0], np.cumsum(log.length.sum(axis=1, dtype=np.int64))))
-    counts = np.concatenate(([0], np.cumsum(log.sent.sum(axis=1))))
     fields["track"] = log.track[first : last + 1]
     fields["data"] = log.data[int(ends[first]) : int(ends[last])]
-    fields["received"] = log.received[int(counts[first]) : int(counts[last])]
+    fields["received"] = log.received[log.sent_ends[first] : log.sent_ends[last]]
     if log.heard is not None:
         a, b = log.heard_ends[first], log.heard_ends[last]
         heard = ReceivedFrames(*(values[a:b] for values in log.heard))

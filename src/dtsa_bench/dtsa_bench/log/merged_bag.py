@@ -14,7 +14,7 @@ import numpy as np
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import pack_received
-from dtsa_bench.log.arrays import FlightArrays
+from dtsa_bench.log.arrays import DECIDED, VECTORS, FlightArrays
 from dtsa_bench.log.bag.cdr import COLLIDED, SENDING, WAITING, MarkerPacker, OdometryPacker
 from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RUN_ID
@@ -39,7 +39,6 @@ from .agent_bag import find_bags, read_all
 from .merge.merge import Merge
 
 _VIEW_NS = 50_000_000  # from one picture of the swarm to the next
-_DECIDED = ("chosen", "reason", "digest", "score")
 
 
 def open_log(path: str | Path) -> FlightLog:
@@ -117,13 +116,12 @@ def _write_bag(directory: Path, log: FlightArrays) -> None:
 def _record_fields(log: FlightArrays, row: int, frames: Mapping[tuple[int, int], bytes]) -> dict[str, Any]:
     """The fields of the record of a slot; `frames`: all that were sent, by slot and sender."""
     slot, here, senders = log.first_slot + row, np.flatnonzero(log.known[row]), np.flatnonzero(log.length[row])
-    first = int(log.sent[:row].sum())
     sent = {sender + 1: frames[slot, sender + 1] for sender in senders.tolist()}
     fields = {
-        "agent": here + 1, **{name: getattr(log, name)[row, here] for name in (*_DECIDED, "offset_ns")},
+        "agent": here + 1, **{name: getattr(log, name)[row, here] for name in (*DECIDED, "offset_ns")},
         "track": log.track[row][:, :, here],
-        **{name: getattr(log, name)[row][:, here] for name in ("velocity", "command", "goal")},
-        **frame_fields(sent, log.received[first : first + len(sent)]),
+        **{name: getattr(log, name)[row][:, here] for name in VECTORS},
+        **frame_fields(sent, log.received[log.sent_ends[row] : log.sent_ends[row + 1]]),
         **{name: getattr(log, name)[row, senders] for name in ("sent_ns", "lost", "collided")},
         "presence": [] if log.presence is None else log.presence[row, here],
     }  # fmt: skip

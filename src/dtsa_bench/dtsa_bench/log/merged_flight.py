@@ -281,14 +281,14 @@ def check_rules(log: FlightArrays, unsent: Mapping[tuple[int, int], bytes]) -> R
 
     :param unsent: frames that were made and not sent, by slot and agent.
     """
-    judge, by_slot = RuleChecker(log.config.swarm), dict[int, dict[int, bytes]]()
+    rules, by_slot = RuleChecker(log.config.swarm), dict[int, dict[int, bytes]]()
     for (slot, agent), data in unsent.items():
         by_slot.setdefault(slot, {})[agent] = data
     for row in range(len(log)):
-        slot, senders = log.first_slot + row, np.flatnonzero(log.length[row]).tolist()
-        if senders or slot in by_slot:
-            judge.check_slot(slot, {sender + 1: log.frame(row, sender + 1) for sender in senders}, by_slot.get(slot))
-    return judge
+        slot, frames = log.first_slot + row, log.frames_in(row)
+        if frames or slot in by_slot:
+            rules.check_slot(slot, frames, by_slot.get(slot))
+    return rules
 
 
 def count_unmatched_frames(log: FlightArrays) -> int:

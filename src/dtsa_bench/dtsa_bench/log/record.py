@@ -20,7 +20,7 @@ from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
 from dtsa_bench.log.bag.reader import Bag, register_type
 
-from .arrays import PRESENT, UNKNOWN, ReceivedFrames, empty_arrays, split_log, swarm_section
+from .arrays import DECIDED, PRESENT, UNKNOWN, VECTORS, ReceivedFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
 
 SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
@@ -36,7 +36,6 @@ _KINDS = {
     "heard_ns": "i8", "heard_by": "u1", "heard_before": "u1", "heard_length": "u1", "heard_data": "u1",
 }  # fmt: skip
 _NOTHING = {name: np.zeros(0, kind) for name, kind in _KINDS.items()}
-_DECIDED = ("chosen", "reason", "digest", "score")
 
 
 @cache
@@ -239,10 +238,10 @@ class _Rows:
         arrays["outcome"][rows] = [min(int(record.outcome), UNKNOWN) for record in records]
         stamps = [(int(record.header.stamp.sec), int(record.header.stamp.nanosec)) for record in records]
         arrays["start_ns"][rows] = [sec * _SECOND + ns - names.TIME_ZERO_NS for sec, ns in stamps]
-        for name in _DECIDED:
+        for name in DECIDED:
             fill(name, (count,), own)
         planes = (rows, slice(None), at) if isinstance(at, slice) else (rows[:, None, None], np.arange(3)[:, None], at)
-        for name in ("velocity", "command", "goal"):
+        for name in VECTORS:
             fill(name, (3, count), planes)
         for row, record in zip(rows.tolist(), records, strict=True):
             arrays["track"][row][:, :, at] = record.track.reshape(steps, 3, count)

@@ -22,10 +22,9 @@ from dtsa_agent.keys import with_key
 from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import metrics_tables
 
-from .arrays import NEW, PRESENT, UNRECORDED, FlightArrays
+from .arrays import DECIDED, NEW, PRESENT, UNRECORDED, FlightArrays
 
 _MAX_DIFFERENCES = 5  # kept of each replay
-_DECIDED = ("chosen", "reason", "digest", "score")
 
 
 class DecisionDifference(NamedTuple):
@@ -112,7 +111,7 @@ class AgentReplay:
     def _compare(self, log: FlightArrays, row: int, slot: int) -> None:
         """Compare what the agents decided for a slot, and their frames, with the log."""
         swarm, at, found = self.swarm, self._columns, {}
-        for name in _DECIDED:
+        for name in DECIDED:
             expected, recorded = getattr(swarm, name), getattr(log, name)[row, at]
             if expected.tobytes() != recorded.tobytes():
                 for local in np.flatnonzero(expected.view(np.uint8) != recorded.view(np.uint8)).tolist():
@@ -146,7 +145,7 @@ def replay_tables(log: FlightArrays, tables: Swarm, delivery: DeliveryCounts | N
     :param delivery: counts what was sent, arrived, and was taken in.
     """
     frames = log.sent_frames
-    starts = np.searchsorted(frames.row, np.arange(len(log) + 1)).tolist()
+    starts = log.sent_ends
     shared = len(tables.observer) == 1 and tables.observer[0] < 0
     scenario = log.scenario
     assert scenario is not None

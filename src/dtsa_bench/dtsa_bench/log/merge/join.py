@@ -12,7 +12,7 @@ from dtsa_agent.air.port import frame_in
 from dtsa_agent.air.record import ReceivedFrame, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.log.agent_bag import AgentBag
-from dtsa_bench.log.arrays import NEW, UNKNOWN, FlightArrays, ReceivedFrames, empty_arrays, split_log
+from dtsa_bench.log.arrays import DECIDED, NEW, UNKNOWN, VECTORS, FlightArrays, ReceivedFrames, empty_arrays, split_log
 from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.merged_flight import run_of
@@ -21,7 +21,6 @@ from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 from .timeline import Process, process_name
 
 _SECTIONS = ("swarm", "limits", "mode")  # of the configuration: there is no simulated channel, and no simulated clocks
-_DECIDED, _VECTORS = ("chosen", "reason", "digest", "score"), ("velocity", "command", "goal")
 _MAX_SLOT = 0xFFFFFFFF
 
 
@@ -87,9 +86,9 @@ def _add_account(
     arrays["known"][row, column] = True
     arrays["presence"][row, column] = record.present | (NEW if record.is_first else 0)
     arrays["offset_ns"][row, column] = own_ns - arrays["start_ns"][row]
-    for name in _DECIDED:
+    for name in DECIDED:
         arrays[name][row, column] = getattr(record, name)
-    for name in _VECTORS:
+    for name in VECTORS:
         arrays[name][row, :, column] = getattr(record, name)
     arrays["track"][row, :, :, column] = record.track
     return own_ns

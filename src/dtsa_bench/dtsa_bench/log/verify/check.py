@@ -14,8 +14,8 @@ from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.writer import BROKEN_OFF
 from dtsa_bench.log.agent_bag import find_bags, read_all
 from dtsa_bench.log.merge.merge import Merge
+from dtsa_bench.log.merged_flight import check_rules
 from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, build_log, check_format
-from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.config import LOCKSTEP, REALTIME
 from dtsa_bench.runs.delivery import recorded_problem
 
@@ -79,14 +79,8 @@ def _verify_agents(paths: Sequence[Path], result: Result) -> None:
 
 def _check_sniffed(log: FlightArrays, result: Result) -> None:
     """What a listener heard: frames tell of themselves whether they keep to the rules."""
-    judge, slots = RuleChecker(log.config.swarm), log.sent_frames
-    frames: dict[int, dict[int, bytes]] = {}
-    for row, sender, data in zip(slots.row.tolist(), slots.sender.tolist(), slots.data, strict=True):
-        frames.setdefault(row + log.first_slot, {})[sender] = data
-    for slot in sorted(frames):
-        judge.check_slot(slot, frames[slot])
     result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
-    result.note_rules(judge)
+    result.note_rules(check_rules(log, {}))
     result.skipped["decisions"] = "a listener does not know them"
 
 

@@ -72,10 +72,9 @@ def _first_mismatch(log: FlightArrays, expected: FlightArrays) -> Mismatch | Non
         pairs = zip(frames.data, recorded_frames.data, strict=False)
         at = next((k for k, (one, other) in enumerate(pairs) if one != other), 0)
         row = int(min(frames.row[at : at + 1].tolist() + recorded_frames.row[at : at + 1].tolist(), default=0))
-        sent = [{k + 1: part.frame(row, k + 1) for k in np.flatnonzero(part.length[row]).tolist()}
-                for part in (expected, log)]  # fmt: skip
-        if sent[0] != sent[1]:
-            found.append((row, frame_difference(*sent, row, log.config.swarm.extent_m)))
+        right, recorded = expected.frames_in(row), log.frames_in(row)
+        if right != recorded:
+            found.append((row, frame_difference(right, recorded, row, log.config.swarm.extent_m)))
     if len(frames.row) == len(recorded_frames.row) and (frames.received != log.received).any():
         k, column = (int(index[0]) for index in np.nonzero(frames.received != log.received))
         row, sender = int(frames.row[k]), int(frames.sender[k])
@@ -97,10 +96,9 @@ def _check_summary(log: FlightArrays, result: Result, metrics: FlightMetrics) ->
 
 
 def _check_safety(log: FlightArrays, result: Result, metrics: FlightMetrics, lossless: bool) -> None:
-    judge, closest = RuleChecker(log.config.swarm), metrics.closest()
+    rules, closest = RuleChecker(log.config.swarm), metrics.closest()
     for row in range(len(log)):
-        senders = np.flatnonzero(log.length[row]).tolist()
-        judge.check_slot(row, {sender + 1: log.frame(row, sender + 1) for sender in senders})
+        rules.check_slot(row, log.frames_in(row))
     crowded, agreement = int((log.sent.sum(axis=1) > 1).sum()), bool((log.chosen == log.chosen[:, :1]).all())
     result.safety = {
         "slots_with_two_senders": crowded,
@@ -109,7 +107,7 @@ def _check_safety(log: FlightArrays, result: Result, metrics: FlightMetrics, los
         "closest_pair": list(closest[1]),
         "crashed": metrics.crash_slot >= 0,
     }
-    result.note_rules(judge)
+    result.note_rules(rules)
     if lossless and (crowded or not agreement):
         why = "without loss all agents hear the same and choose the same"
         raise Mismatch(Difference("two senders in one slot", "never", f"{crowded} slots", why))
