@@ -15,24 +15,18 @@ from typing import Any
 from dtsa_agent.air.port import AIRS, PortSettings, check_fits, settings_class
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import ConfigError, did_you_mean
 from dtsa_agent.core.settings.declaration import Setting, Settings, names_with_values, settings_of
 from dtsa_agent.core.station import check_joinable
 from dtsa_agent.keys import check_key, check_session
 from dtsa_agent.yaml_file import read_yaml
 from dtsa_bench.runs.options import add_options, given_options, number
 
-from .registry import Command, hint
+from .registry import Command
 
 DEFAULT_POLICY = "lease"
-
-
 _NO_OPTION = ("policy", "auth", *(s.name for s in settings_of(SwarmConfig) if s.group == "Priority and selection"))
-
-
 _ROS = "/**", "ros__parameters"  # of a file of ROS parameters, which counts as well
-
-
 _OPTIONS = {"policy": "policy", "auth": "seal"}  # settings whose options are called otherwise
 
 
@@ -102,7 +96,8 @@ def _read_file(args: argparse.Namespace) -> None:
         if name == "id":
             raise ConfigError(f"id in {path}", value, "what all agents share; each has an --id of its own")
         if name not in settings:
-            allowed = f"a setting of the swarm, of the port {args.air} or of the agent{hint(str(name), settings)}"
+            question = did_you_mean(str(name), settings)
+            allowed = f"a setting of the swarm, of the port {args.air} or of the agent{question}"
             raise ConfigError(f"{name} in {path}", value, allowed)
         section, setting = settings[name]
         option = _OPTIONS.get(name, f"{section}.{name}")

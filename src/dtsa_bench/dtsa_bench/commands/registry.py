@@ -83,7 +83,7 @@ def load_command(name: str) -> Command:
 
 
 def hint(word: str, words: Iterable[str]) -> str:
-    """A question that names the nearest of the words that would have been right; empty if none is near."""
+    """As ``core.errors.did_you_mean``, where nothing is installed yet."""
     near = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
     return f"; did you mean {near[0]}?" if near and near[0] != word else ""
 
