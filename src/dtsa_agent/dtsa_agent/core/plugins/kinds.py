@@ -45,7 +45,6 @@ class Table:
     def observation(self, slot: int) -> NDArray[np.float32]:
         """What the agent has heard before a slot and its own state, as numbers for learning (docs/how-to/learning.md).
 
-        :returns: (10 + 9 N,), units as ``dtsa.env.fields`` has them.
         :raises ValueError: for the table of an agent that is elsewhere.
         """
         observed: NDArray[np.float32] = self._swarm.observations(slot, self._row, self._row + 1)[0]
@@ -67,25 +66,13 @@ class OwnFrameData(Protocol):
     own_bytes: ClassVar[int] = 0
 
     def own_data(self, table: Table, slot: int) -> bytes:
-        """Return the data for the frame that this agent sends in a slot.
-
-        :returns: exactly ``own_bytes`` bytes; another length ends the flight with a PluginError.
-        """
+        """Return the data for the frame that this agent sends in a slot: exactly ``own_bytes`` bytes."""
 
     def receive_data(self, table: Table, slot: int, sender: int, data: bytes) -> None:
-        """Receive the data of another agent's same part.
-
-        :param table: with the state of the same frame already.
-        :param slot: in which the frame was received.
-        :param sender: id of the other agent.
-        :param data: ``own_bytes`` bytes, unverified unless frames are authenticated.
-        """
+        """Receive the data of another agent's same part; the table has the state of the same frame already."""
 
     def slot_over(self, table: Table, slot: int, outcome: SlotOutcome) -> None:
-        """Note the outcome of a slot that is over.
-
-        :param outcome: for this observer; receivers without collision detection see silence.
-        """
+        """Note the outcome of a slot for this observer; receivers without collision detection see silence."""
 
 
 class Policy(Protocol):
@@ -96,32 +83,23 @@ class Policy(Protocol):
     """
 
     def choose(self, table: Table, slot: int) -> int:
-        """Return the agent that is expected to send in a slot.
-
-        :returns: its id, 1 to N, 0: none. The observer sends if it is its own id.
-        """
+        """Return the id of the agent expected to send in a slot, 0: none. The observer sends if it is its own id."""
 
 
 class Genie(Protocol):
     """Central policy that knows all agents' states: a bound for comparison. Created once, for agent 0."""
 
     def senders(self, swarm: Swarm, slot: int) -> Sequence[int]:
-        """Return the agents that send in a slot.
-
-        :param swarm: true states and tables of all agents, read-only.
-        :returns: their ids, 1 to N.
-        """
+        """Return the ids that send in a slot; ``swarm``: true states and tables of all agents, read-only."""
 
 
 class Radio(Protocol):
     """The radio of an agent that is not bound to slots."""
 
     def send(self) -> bool:
-        """Begin to send the agent's frame, with its state at the start of the slot.
+        """Begin to send the agent's frame, with its state at the start of the slot; False: another one is on the air.
 
         A carrier-sensing radio keeps the frame, and begins when :meth:`CarrierSensing.sensed` returns 0.
-
-        :returns: False: the radio is still sending another packet.
         """
 
 
@@ -132,12 +110,7 @@ class UnslottedPolicy(Protocol):
     """
 
     def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
-        """Act at an instant, first at 0.
-
-        :param table: at the start of the slot.
-        :param radio: sends the agent's frames.
-        :returns: when to be called again, ns, later than now.
-        """
+        """Act at an instant, first at 0, with the table of the slot's start; returns when to be called again, ns."""
 
 
 class CarrierSensing(UnslottedPolicy, Protocol):
@@ -156,28 +129,17 @@ class CarrierSensing(UnslottedPolicy, Protocol):
         """
 
     def sent(self, table: Table, now_ns: int) -> int:
-        """Note that the radio has begun to send.
-
-        :returns: when ``wake`` is to be called, ns, later than now.
-        """
+        """The radio has begun to send at ``now_ns``; returns when ``wake`` is to be called, ns, later than that."""
 
 
 class PacketRadio(Radio, Protocol):
     """The radio of an agent whose policy has packets of its own. It sends one packet at a time."""
 
     def send(self, note: bytes = b"", to: int = 0) -> bool:
-        """Begin to send the agent's frame behind a header.
-
-        :param note: the header, of any length that the radio's packets allow.
-        :param to: id of the only agent that accepts it, 0: all.
-        :returns: False: the radio is still sending another packet.
-        """
+        """Send the frame behind a header ``note``; ``to``: id of the only agent that accepts it, 0: all."""
 
     def send_note(self, note: bytes) -> bool:
-        """Begin to send a packet without a frame.
-
-        :returns: False: the radio is still sending another packet.
-        """
+        """Begin to send a packet without a frame; False: another one is on the air."""
 
     def frame(self) -> bytes:
         """Return the agent's frame, with its state at the start of the slot, for the policy's own packets.
@@ -188,8 +150,7 @@ class PacketRadio(Radio, Protocol):
     def receive_frame(self, frame: bytes, slot: int) -> None:
         """Pass a frame to the agent that its policy has decoded from packets.
 
-        :param frame: as :meth:`frame` of its sender returned it.
-        :param slot: in which that was, perhaps many slots ago.
+        :param slot: in which the sender's :meth:`frame` returned it, perhaps many slots ago.
         """
 
 
@@ -197,10 +158,8 @@ class PacketReceiver(UnslottedPolicy, Protocol):
     """An unslotted policy that acts on each packet as it arrives, for example a token ring."""
 
     def received(self, table: Table, now_ns: int, sender: int, note: bytes) -> int:
-        """Receive a packet.
+        """Receive a packet; ``note``: its bytes without the frame.
 
-        :param sender: id of the agent that sent it.
-        :param note: its bytes without the frame.
         :returns: when to call ``wake`` next, ns, later than now; replaces the time returned before.
         """
 
@@ -214,13 +173,7 @@ class Estimator(Protocol):
     needs_intent: ClassVar[bool] = False
 
     def estimate(self, table: Table, slot: int, step: int, position: Array, velocity: Array) -> None:
-        """Write the estimates of the other agents' states at a control instant.
-
-        :param step: number of the control instant in the slot, from 0: the slot's start.
-        :param position: (3, N) m, frame map, to be filled; column ``id - 1`` is agent ``id``.
-        :param velocity: (3, N) m/s, frame map, to be filled. Numbers that are not finite end the flight with a
-            PluginError.
-        """
+        """Write the estimates for control instant ``step`` of a slot into (3, N) arrays, m and m/s."""
 
 
 class Avoider(Protocol):
@@ -229,9 +182,4 @@ class Avoider(Protocol):
     model: ClassVar[str] = "orca"
 
     def command(self, table: Table, slot: int, step: int) -> Sequence[float]:
-        """Return the velocity that the agent's vehicle shall fly.
-
-        :param table: with the estimates of this instant.
-        :param step: number of the control instant in the slot, from 0.
-        :returns: (3,) m/s, frame map; numbers that are not finite end the flight with a PluginError.
-        """
+        """Return the commanded velocity, (3,), m/s, frame map; ``table`` has the estimates of this instant."""
