@@ -37,7 +37,7 @@ def _show_in_notebooks() -> None:
     shell = ipython.get_ipython() if ipython is not None else None
     if shell is not None:
         formatter = shell.display_formatter.formatters["image/png"]
-        if Figure not in formatter.type_printers:  # somebody else did, perhaps with settings
+        if Figure not in formatter.type_printers:  # another one did, perhaps with settings
             formatter.for_type(Figure, _png)
 
 
