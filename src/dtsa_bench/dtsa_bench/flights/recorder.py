@@ -38,7 +38,7 @@ _REPORTED = ("chosen", "reason", "digest", "score", "offset_ns", "track", "veloc
 
 
 class FlightRecorder(ChannelObserver):
-    """Writes a flight into a bag, slot after slot; see docs/reference/bag.md for topics and times.
+    """Writes a flight into a bag, slot after slot; see docs/reference/nodes.md for topics and times.
 
     A slot counts as flown once all agents have told where it took them, in their answers to the next one. What a flight
     that is cut short leaves half done does not get into its bag.
