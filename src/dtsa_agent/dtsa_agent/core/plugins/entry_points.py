@@ -143,9 +143,9 @@ class PluginSwarm(Swarm):
             if size:
                 yield part.check_own_data(part.own_data(self.tables[index], slot), size)
 
-    def frame(self, local_index: int) -> bytes:
-        data = self._encoded(local_index)
-        return self._sealed(data + self._appended[local_index] if data and self._own_bytes else data)
+    def _encoded(self, local_index: int) -> bytes:
+        data = super()._encoded(local_index)
+        return data + self._appended[local_index] if data and self._own_bytes else data
 
     def _receive(self, slot: int, frame: bytes, mask: Bytes | None) -> bool:
         end = max(0, len(frame) - self._own_bytes)

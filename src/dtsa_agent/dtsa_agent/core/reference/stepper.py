@@ -32,7 +32,7 @@ def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
     same = {field.name: getattr(config, field.name) for field in fields(Rules) if hasattr(config, field.name)}
     return Rules(**{
         **same, "tau": flight_model(config.avoider, config.options).vehicle.tau, "key": policy_key(config.seed),
-        "profile": PROFILES[2 if config.extended else 1 if config.estimator_row.needs_intent else 0],
+        "profile": PROFILES[config.profile],
         "position_step": position_step(config.extent_m), "open_every": config.open_period,
         "targets_known": config.targets_known and scenario.goals_known,
     })  # fmt: skip
