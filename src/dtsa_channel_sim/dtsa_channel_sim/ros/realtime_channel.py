@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from functools import partial
-from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start
 from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.messages import Fields, header_of, ns_of, read_report
-from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
+from dtsa_channel_sim.model.air import NEVER, Air, Arrivals, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
 from dtsa_channel_sim.model.verdict import Verdict
@@ -102,8 +101,7 @@ class LiveAir:
         self.hold_ns = max(round(_GRACE * config.slot_ns), config.airtime.from_radio_ns(0))
         self._window_ns = round(_WINDOW * config.slot_ns)
         self.frames: dict[SentFrame, bytes] = {}  # that are or were on the air, until their slot is closed
-        self._arriving: list[tuple[int, int, FrameVerdict[SentFrame]]] = []  # on lines: a heap by arrival
-        self._count = 0
+        self._arriving = Arrivals()  # verdicts
         self._resolved_ns = -NEVER
 
     @property
@@ -114,7 +112,7 @@ class LiveAir:
     @property
     def waits(self) -> bool:
         """Whether a frame waits for its delivery."""
-        return bool(self._air.pending or self._arriving)
+        return self._air.pending > 0 or self._arriving.next_ns < NEVER
 
     def hand_over(self, key: SentFrame, start_ns: int, data: bytes) -> bool:
         """Put a frame on the air; return False if it came too late."""
@@ -129,23 +127,18 @@ class LiveAir:
         while (due := self._air.due_ns) <= ripe:
             self._resolve(due, positions)
         self._resolve(late, positions)
-        arrived = []
-        while self._arriving and self._arriving[0][0] <= now:
-            arrived.append(heappop(self._arriving)[2])
-        return arrived
+        return self._arriving.pop(now)
 
     def _resolve(self, until_ns: int, positions: Positions) -> None:
         if until_ns <= self._resolved_ns:
             return
         self._resolved_ns = until_ns
         for verdict in self._air.resolve(until_ns, positions):
-            self._count += 1
-            heappush(self._arriving, (verdict.arrival_ns, self._count, verdict))
+            self._arriving.add(verdict.arrival_ns, verdict)
 
     def spare_ns(self, now: int, most_ns: int) -> int:
         """Return for how long there is nothing to do, ns, at most ``most_ns``."""
-        arrival = self._arriving[0][0] if self._arriving else NEVER
-        return min(max(0, min(self._air.due_ns + self.hold_ns, arrival) - now), most_ns)
+        return min(max(0, min(self._air.due_ns + self.hold_ns, self._arriving.next_ns) - now), most_ns)
 
 
 class RealtimeChannel(RosChannel):
