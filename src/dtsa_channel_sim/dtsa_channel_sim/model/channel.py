@@ -132,13 +132,12 @@ class Channel:
 
     def _arbitrate_one(self, slot: int, sender: int, alone: Verdict) -> Verdict:
         """Return the verdict on the only frame of a slot, everybody in reach."""
-        lost = self._losses.lost(slot, sender)
-        received = ~lost
-        received[0, sender - 1] = False
+        received = ~self._losses.lost(slot, sender)
+        received[sender - 1] = False
         missing = len(self._alone) - 1 - int(np.count_nonzero(received))
         if not missing:
             return alone
-        return Verdict(SUCCESS, alone.senders, received, (missing,), (0,))
+        return Verdict(SUCCESS, alone.senders, received[None], (missing,), (0,))
 
     def _arbitrate_many(
         self, slot: int, follows: bool, senders: tuple[int, ...], lengths: Sequence[int] | None,

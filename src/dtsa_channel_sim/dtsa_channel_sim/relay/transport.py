@@ -243,4 +243,4 @@ class Transport:
             digest = hashlib.sha256(f"{self.config.seed} {message.topic}".encode()).digest()
             source = NoiseSource(int.from_bytes(digest[:8], "little") >> 1, self.config.agents)
             losses = self._noise[message.topic] = Losses(self.config, source)
-        return losses.lost(message.number, message.sender)[0]
+        return losses.lost(message.number, message.sender)

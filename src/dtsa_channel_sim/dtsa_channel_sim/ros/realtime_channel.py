@@ -162,7 +162,7 @@ class RealtimeChannel(RosChannel):
         self.accounts = Accounts(self.agents, steps, max(100, _KEEP_NS // self.slot_ns))
         self.air = LiveAir(channel)
         self.pace = Pace(self.slot_ns)
-        self.round_ms: float | None = None  # of a round of messages before slot 0, median
+        self.round_ms: float | None = None  # of the last round of messages before slot 0
         self._attendance = Attendance(self.agents, self.lost)
         self._steps = steps
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0
@@ -215,9 +215,8 @@ class RealtimeChannel(RosChannel):
         """Wait until all agents have reported, and publish when slot 0 starts; return False when stopped."""
         if not self._call(stop, self.lost):
             return False
-        roll_call = RollCall(
-            self._publisher, self._reports, self.run_id, self._calling, Accounts(self.agents, self._steps, 1)
-        )
+        accounts = Accounts(self.agents, self._steps, 1)
+        roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling, accounts)
         awaited = set(range(1, self.agents + 1))
 
         def still_awaited() -> set[int]:
@@ -229,7 +228,7 @@ class RealtimeChannel(RosChannel):
         if not self._await_all(stop, roll_call.call, still_awaited, _TICK_NS):
             return False
         # An agent that is late with its first report has been nowhere else.
-        answers = roll_call.answers
+        answers = accounts[names.FIRST_CALL]
         answers.carry(self.answers)
         self.answers = answers
         absent = set(self.lost)
@@ -239,7 +238,7 @@ class RealtimeChannel(RosChannel):
             return bool(stop) or self.lost != absent
 
         present = set(range(1, self.agents + 1)) - absent
-        self.round_ms = roll_call.round_ms(present, _TIGHT * self.slot_ns / 1e6, is_disturbed)
+        self.round_ms = roll_call.settle(present, _TIGHT * self.slot_ns / 1e6, is_disturbed)
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import time
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,11 +19,11 @@ from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common import checks, names
 from dtsa_agent.ros.common.checks import BadMessage, PublisherGuard
 from dtsa_agent.ros.common.loop import Feed
-from dtsa_agent.ros.common.messages import Fields, read_report
+from dtsa_agent.ros.common.messages import read_report
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_agent.ros.common.runs import run_text
 
-from .answers import Accounts, Answers
+from .answers import Accounts
 
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s
@@ -32,9 +31,8 @@ _LEFT_OVER_S = 3.0  # agents whose channel has gone end within this time
 _MOST_OTHERS = 256  # processes of other runs, or for the same agents
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 _RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
-_ROUNDS, _LONGEST_S = 20, 0.5  # of one measurement
-_SHORTER = 0.8  # rounds that take so much of what those before took become shorter
-_SETTLED_S = 10.0  # after that a measurement counts however long rounds take
+_LONGEST_S = 0.5  # of one round of messages
+_SETTLED_S = 10.0  # after that the run starts, however long rounds take
 _PAUSE_S = 0.0001
 _BURST = 256  # messages; whatever comes, the clock is looked at
 
@@ -268,7 +266,7 @@ class Attendance:
 
 
 class RollCall:
-    """Calls all agents before slot 0 in real time, by number, and measures how long messages take on this machine.
+    """Calls all agents before slot 0 in real time, by number, until all answer in time.
 
     ``accounts`` get the answers, ``calling`` is the call as slot messages carry it.
     """
@@ -286,58 +284,32 @@ class RollCall:
         self._publisher.publish(Slot(run=self._run_id, phase=Slot.PREPARE, slot=self._number, data=data))
 
     def present(self) -> set[int]:
-        """Return the agents that have answered the first call since this was asked."""
+        """Return the agents that have answered the last call since this was asked."""
         present: set[int] = set()
-        for message in self._answers():
-            with suppress(BadMessage):
-                self._accounts.add(message, self._number)
-                present.update(message.agent)
-        return present
-
-    @property
-    def answers(self) -> Answers:
-        """What all have answered to the first call: where they are, above all."""
-        return self._accounts[names.FIRST_CALL]
-
-    def _answers(self) -> Iterator[Fields]:
-        """Give answers to the last call that have come in, some at a time."""
         for _ in range(_BURST):
             data = self._reports.take()
             if data is None:
-                return
-            try:
+                break
+            with suppress(Exception):  # rclpy has no common base for what a message can do to it
                 message = read_report(data)
-            except Exception:  # rclpy has no common base for what a message can do to it
-                continue
-            if message.run == self._run_id and message.slot.tolist() == [self._number]:
-                yield message
+                if message.run == self._run_id and message.slot.tolist() == [self._number]:
+                    self._accounts.add(message, self._number)
+                    present.update(message.agent)
+        return present
 
-    def round_ms(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
-        """Return how long a round of messages takes, from a call to the last answer: ms, median over some rounds.
+    def settle(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
+        """Call until a round of messages, from a call to the last answer, is short enough, or for some seconds.
 
-        Many processes may have found the channel and still look for each other. So a measurement is repeated for some
-        seconds while only some answer in time, or rounds that take too long become shorter.
+        Many processes may have found the channel and still look for each other. Return how long the last round took.
         """
-        end, before = time.monotonic() + _SETTLED_S, math.inf
+        end_s = time.monotonic() + _SETTLED_S
         while True:
-            took, silent = self._series(agents)
-            settled = silent == agents or (not silent and (took <= enough_ms or took > _SHORTER * before))
-            if settled or time.monotonic() > end or give_up():
-                return took
-            before = math.inf if silent else took
-
-    def _series(self, agents: set[int]) -> tuple[float, set[int]]:
-        """Return the median of some rounds, ms, and the agents that did not answer in time in the last of them."""
-        end, rounds = time.monotonic() + _LONGEST_S, []
-        for _ in range(_ROUNDS):
-            begin, awaited = time.monotonic(), set(agents)
+            begin_s, awaited = time.monotonic(), set(agents)
             self._number += 1
             self.call()
-            while awaited and time.monotonic() < end:
+            while awaited and time.monotonic() < begin_s + _LONGEST_S:
                 time.sleep(_PAUSE_S)
-                for message in self._answers():
-                    awaited.difference_update(message.agent)
-            rounds.append(time.monotonic() - begin)
-            if time.monotonic() >= end:
-                break
-        return float(np.median(rounds)) * 1e3, awaited
+                awaited -= self.present()
+            took_ms = (time.monotonic() - begin_s) * 1e3
+            if took_ms <= enough_ms or time.monotonic() > end_s or give_up():
+                return took_ms
