@@ -141,8 +141,7 @@ class RosChannel:
             def awaited() -> set[int]:
                 self._read_processes()
                 check_others()
-                done = self.roster.complete(time.monotonic(), absent)
-                return set() if done else set(self.roster.missing) - absent or {0}
+                return self.roster.awaited(time.monotonic(), absent)
 
             self.roster.closed = self._await_all(stop, call, awaited, _CALL_NS)
         return self.roster.closed
@@ -255,7 +254,7 @@ class RosChannel:
     def _meet_processes(self) -> None:
         """Process the messages of processes about themselves, and decide about those that came late."""
         self._read_processes()
-        for process, error in self.roster.refuse_rivals(time.monotonic(), self.lost) if self.roster.closed else ():
+        for process, error in self.roster.decide(time.monotonic(), self.lost) if self.roster.closed else ():
             self._refuse(process, error)
 
     def _housekeeping(self) -> None:
