@@ -26,7 +26,7 @@ from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .answers import Accounts, Answers, DeliveredFrame
+from .answers import Accounts, Answers
 from .ros_channel import RosChannel
 from .roster import Attendance, RollCall
 
@@ -341,7 +341,7 @@ class RealtimeChannel(RosChannel):
             time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
             data = self._pack_slot(time_ns, slot, slot, (sender,), (frame,), verdict.received[None])
             self._publisher.publish(data)
-            self.accounts.deliver(slot, sender, DeliveredFrame(frame, verdict.arrival_ns, verdict.received))
+            self.accounts.deliver(slot, sender, frame, verdict.arrival_ns, verdict.received)
             self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
 
     # The accounts.
