@@ -58,15 +58,15 @@ class RecordedFlight:
         self.run_config, self.directory = run, directory
         self.scenario = make_scenario(run.swarm)
         self.measurement = FlightMeasurement(run, self.scenario)
-        model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
+        model, steps, over = Channel(run.air), run.swarm.steps, self.measurement.over
         self.run_id = identity.number
         limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed}
         limits["swarm_namespace"] = space
         self.channel: LockstepChannel | RealtimeChannel
         if run.mode == LOCKSTEP:
-            self.channel = LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
+            self.channel = LockstepChannel(node, model, steps, answer_s, over=over, **limits)
         else:
-            self.channel = RealtimeChannel(node, model, steps, referee=referee, **limits)
+            self.channel = RealtimeChannel(node, model, steps, over=over, **limits)
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
             FlightRecorder(directory / BAG, run, self.scenario, self.run_id),

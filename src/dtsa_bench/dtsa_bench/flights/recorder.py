@@ -87,8 +87,7 @@ class FlightRecorder(ChannelObserver):
         self._complete = slot
         self._answered[:], self._track[:] = answers.answered, answers.track
         if not slot:
-            self._state.phase = RunStatus.FLYING
-            self._write_status()
+            self._write_status(phase=RunStatus.FLYING)
 
     def agent_silent(self, agent: int) -> None:
         self._state.lose(agent)
@@ -104,12 +103,12 @@ class FlightRecorder(ChannelObserver):
         self._write_status()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
-        self._state.phase, self._state.reason = RunStatus.ENDED, reason
+        self._state.reach(self._complete, phase=RunStatus.ENDED, reason=reason)
 
-    def _write_status(self) -> None:
-        self._state.slot = max(0, self._complete)
-        at = self._time_ns(self._state.slot)
-        self.bag.write(self._status, bytes(serialize_message(self._state.message())), at, at)
+    def _write_status(self, **changed: Any) -> None:
+        self._state.reach(self._complete, **changed)
+        at = self._time_ns(max(0, self._complete))
+        self.bag.write(self._status, bytes(serialize_message(self._state.message)), at, at)
 
     def _write_pending(self) -> None:
         """Write all about the slot before the last one that was answered."""
