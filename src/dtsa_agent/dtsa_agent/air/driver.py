@@ -24,9 +24,8 @@ from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.priority import realtime_thread, wake_precisely
 from dtsa_agent.stop import Stop
 
-from .port import ClockMap, DatagramPort, check_fits, lateness_ns, link_of
-from .record import AgentCounts, ReceivedFrame, SlotRecord, Watcher
-from .reports import Reports
+from .port import ClockMap, Port, check_fits, lateness_ns, link_of
+from .record import AgentCounts, ReceivedFrame, Reports, SlotRecord, Watcher
 from .settings import AgentSettings
 
 _SECOND = 1_000_000_000
@@ -65,7 +64,7 @@ class LiveAgent:
     """
 
     def __init__(
-        self, own: AgentSettings, config: SwarmConfig, port: DatagramPort, watcher: Watcher | None = None,
+        self, own: AgentSettings, config: SwarmConfig, port: Port, watcher: Watcher | None = None,
         vehicle: AgentVehicle | None = None, log: Callable[[str], None] | None = None,
         show: Callable[[str], None] | None = None,
     ) -> None:  # fmt: skip
@@ -95,11 +94,11 @@ class LiveAgent:
         self._signals = 0
 
     def _start(self) -> Station:
-        now, senses = self.clock.local_ns(time.monotonic_ns()), type(self._vehicle).sense is not AgentVehicle.sense
-        sense = (lambda slot: self._vehicle.sense(self.swarm)) if senses else None
-        return Station(
-            self.swarm, self._settings, now, sense, self, every_frame=bool(self.watcher or self._header is not None)
-        )
+        vehicle, every_frame = self._vehicle, bool(self.watcher or self._header is not None)
+        senses = type(vehicle).sense is not AgentVehicle.sense
+        sense = (lambda slot: vehicle.sense(self.swarm)) if senses else None
+        now = self.clock.local_ns(time.monotonic_ns())
+        return Station(self.swarm, self._settings, now, sense, self, every_frame)
 
     # The loop.
 
@@ -193,7 +192,6 @@ class LiveAgent:
     # Events of the station.
 
     def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
-        """Record the decision for a slot."""
         self._close_record()
         if self.watcher is None:
             return
@@ -205,14 +203,12 @@ class LiveAgent:
         )  # fmt: skip
 
     def restarted(self, slot: int) -> None:
-        """The agent restarts with the next slot."""
         self._close_record()
         self._before.clear()
         self.slot = slot
         self.counts.add_start(slot + 1)
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
-        """Count and record a frame."""
         if accepted and self._header is not None:
             start, late = self.station.slot_start_ns(slot), lateness_ns(datagram, self._header)
             self.counts.add_arrival(arrival_ns - start - self._flight_ns - late)
@@ -221,7 +217,6 @@ class LiveAgent:
             (self._before if self._record is None else self._record.heard).append(frame)
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
-        """Count and record a datagram that was not accepted."""
         self.counts.refused[fault] += 1
         self._reports.foreign(fault, time.monotonic_ns())
         if self.watcher is not None:

@@ -19,10 +19,11 @@ the frame is. Times are integer ns, CLOCK_MONOTONIC unless said otherwise.
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
@@ -39,7 +40,7 @@ _UNIT_NS = 10_000  # of times in the header
 class ClockMap:
     """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift.
 
-    :param offset_ns: by how much it is ahead at ``began_ns``; None: now.
+    :param offset_ns: by how much it is ahead at ``began_ns``, which is now if it is None.
     :param drift_ppb: parts per billion by which it runs fast.
     """
 
@@ -86,7 +87,7 @@ class PortProperties:
     shortest_slot_ns: int = 0  # shorter slots are refused
     turn_ns: int = 0  # of radios that take turns by themselves, how long one of them has its turn
     slots_hold_flights: bool = False  # slots in which a frame may arrive too late for the next one are refused
-    varies: bool = False  # frames arrive by milliseconds earlier or later than others: see `trust_ns`
+    varies: bool = False  # frames arrive by milliseconds earlier or later than others
 
     def header(self, signed: bool) -> Header:
         """What stands before a frame, which carries a tag if it is signed."""
@@ -101,52 +102,70 @@ class ReceivedDatagram(NamedTuple):
     own: bool  # this very port has sent it
 
 
-class Listener(Protocol):
-    """What hears the datagrams of a swarm. A context manager."""
+P = TypeVar("P", bound="Port")
 
-    log: Callable[[str], None] | None  # prints a line when the port fails or is back; its user sets it
 
+class Port(ABC):
+    """What carries the datagrams of an agent with a clock of its own, or brings them to a listener. A context manager.
+
+    What it sends may come back to it, marked as its own.
+    """
+
+    properties: PortProperties
+    log: Callable[[str], None] | None = None  # prints a line when the port fails or is back; its user sets it
+    name: str  # begins these lines
+
+    @abstractmethod
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
 
-    def receive(self, most: int) -> list[ReceivedDatagram]:
-        """Return what has arrived, at most so many datagrams, in this order; empty if nothing has."""
-
-    def counts(self) -> dict[str, int]:
-        """Return what it counts, by name, for the summary."""
-
-    def __enter__(self) -> Listener: ...
-
-    def __exit__(self, *unused: object) -> None: ...
-
-
-class DatagramPort(Listener, Protocol):
-    """What an agent with a clock of its own asks of the port that carries its datagrams."""
-
-    properties: PortProperties
-
+    @abstractmethod
     def send(self, data: bytes) -> str:
         """Send a datagram at once; return why the port has refused it, or an empty text."""
 
+    @abstractmethod
+    def receive(self, most: int) -> list[ReceivedDatagram]:
+        """Return what has arrived, at most so many datagrams, in this order; empty if nothing has."""
+
+    @abstractmethod
+    def counts(self) -> dict[str, int]:
+        """Return what it counts, by name, for the summary."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free it for others."""
+
     def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
         """Hand what others have sent to a station; return how many datagrams have arrived, at most so many."""
+        datagrams = self.receive(most)
+        for datagram in datagrams:
+            if not datagram.own:
+                station.receive(datagram.data, clock.local_ns(datagram.arrival_ns))
+        return len(datagrams)
 
-    def __enter__(self) -> DatagramPort: ...
+    def print(self, text: str) -> None:
+        """Print a line about the port."""
+        if self.log is not None:
+            self.log(f"{self.name} {text}")
+
+    def __enter__(self: P) -> P:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.close()
 
 
 class PortSettings(Protocol):
     """The settings of a kind of port."""
 
     @property
-    def properties(self) -> PortProperties:
-        """What agents, listeners and bags must know of it."""
+    def properties(self) -> PortProperties: ...
 
     @property
     def destination(self) -> str:
-        """Destination of the frames, for logs."""
+        """Where frames go, for logs."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """The settings as plain values."""
+    def to_dict(self) -> dict[str, Any]: ...
 
 
 #: Kinds of port by name, which `--air NAME` and the parameter ``air`` of a node choose from: module, port, settings.
@@ -168,17 +187,15 @@ def settings_class(air: str) -> Any:
     return getattr(import_module("dtsa_agent.air.settings"), _PORTS[air][2])
 
 
-def open_port(settings: PortSettings) -> DatagramPort:
+def open_port(settings: PortSettings) -> Port:
     """Return the port of an agent, or of a listener; only its module is imported.
 
     :raises ConfigError: if it cannot be used.
     """
     module, cls, _ = _PORTS[settings.properties.name]
-    port: DatagramPort = getattr(import_module(f"dtsa_agent.air.{module}"), cls)(settings)
+    port: Port = getattr(import_module(f"dtsa_agent.air.{module}"), cls)(settings)
     return port
 
-
-# The datagram.
 
 NETWORK = PortProperties("udp")  # with the longest header
 HEADER = NETWORK.header(signed=True).size  # bytes before the frame
@@ -193,11 +210,6 @@ def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
 def lateness_ns(datagram: bytes, header: Header) -> int:
     """How much later than its slot a datagram says to have left; 0 where it does not say."""
     return int.from_bytes(datagram[header.agreed : header.agreed + header.late], "little") * _UNIT_NS
-
-
-def trust_ns(config: SwarmConfig, port: PortProperties) -> int:
-    """By how much a frame may be off its slot and still say what time it is."""
-    return config.slot_ns // 4 if port.varies else _TRUST_NS
 
 
 def shortest_slot_ns(config: SwarmConfig, port: PortProperties) -> int:
@@ -218,19 +230,24 @@ def check_fits(config: SwarmConfig, port: PortProperties) -> None:
     """
     shortest_ns = shortest_slot_ns(config, port)
     if config.slot_ns < shortest_ns:
-        allowed = f"at least {-(-shortest_ns // 100_000) / 10:g} over {port.name}"
+        allowed = f"at least {_tenths_ms(shortest_ns)} over {port.name}"
         if port.slots_hold_flights:
             allowed += f" with frames of {config.frame_length} bytes"
         if port.slots_hold_flights and config.extended:
             plain = next(row.name for row in POLICIES.rows.values() if not row.extended)
             short = replace(config, frame="paper", policy=plain if config.policy_row.extended else config.policy)
-            less_ms = -(-shortest_slot_ns(short, port) // 100_000) / 10
-            allowed += f", {less_ms:g} with {short.frame_length} (policy {short.policy}, frame paper)"
+            less = _tenths_ms(shortest_slot_ns(short, port))
+            allowed += f", {less} with {short.frame_length} (policy {short.policy}, frame paper)"
         raise ConfigError("slot_ms", config.slot_ms, allowed)
     room = port.longest - port.header(config.auth).size
     if config.frame_length > room:
         by = f"policy {config.policy}, frame {config.frame}{', sealed' if config.auth else ''}"
         raise ConfigError("frame", f"{config.frame_length} bytes ({by})", f"at most {room} bytes over {port.name}")
+
+
+def _tenths_ms(ns: int) -> str:
+    """A time as ms, rounded up to tenths."""
+    return f"{-(-ns // 100_000) / 10:g}"
 
 
 def header_of(config: SwarmConfig, port: PortProperties = NETWORK) -> bytes:
@@ -243,6 +260,5 @@ def header_of(config: SwarmConfig, port: PortProperties = NETWORK) -> bytes:
 def link_of(config: SwarmConfig, port: PortProperties = NETWORK) -> Link:
     """What carries the datagrams of a swarm, for its stations."""
     header = port.header(config.auth)
-    return Link(
-        header_of(config, port), header.late > 0, header.peers // 4, flight_ns(config, port), trust_ns(config, port)
-    )
+    trust_ns = config.slot_ns // 4 if port.varies else _TRUST_NS  # frames that are off by more do not say the time
+    return Link(header_of(config, port), header.late > 0, header.peers // 4, flight_ns(config, port), trust_ns)
