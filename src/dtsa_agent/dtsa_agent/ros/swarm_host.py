@@ -39,7 +39,7 @@ _SHARED = Setting(
 
 
 @dataclass(frozen=True, slots=True)
-class HostSettings(Settings):
+class HostSettings(PrioritySettings):
     """How agents live in a process, beside what the whole swarm agrees on."""
 
     odometry: bool = setting(True, "offer each agent's true motion as <agent>/odom")
@@ -64,18 +64,12 @@ class RealtimeSettings(Settings):
 
 
 def declare_swarm(node: Node) -> SwarmConfig:
-    """Declare the swarm's settings and return their values.
-
-    :raises ConfigError: for settings that are not usable.
-    """
+    """Declare the swarm's settings and return their values; ConfigError: they are not usable."""
     return SwarmConfig.from_dict(declare_settings(node, SwarmConfig))
 
 
 def declare_ids(node: Node, agents: int) -> list[int]:
-    """Declare which of N agents live in a process; return their ids, ascending.
-
-    :raises ConfigError: if there are others.
-    """
+    """Declare which of N agents live in a process; return their ids, ascending. ConfigError: there are others."""
     listed = declare_list(node, "ids", [0], "ids of the agents in this process; [0]: all")
     ids = sorted(agent for agent in listed if agent) or list(range(1, agents + 1))
     if len(set(ids)) != len(ids) or ids[0] < 1 or ids[-1] > agents:
@@ -84,25 +78,24 @@ def declare_ids(node: Node, agents: int) -> list[int]:
 
 
 def host_agents(
-    node: Node, ids: Sequence[int], config: SwarmConfig, stop: Stop, space: str = names.SWARM, shared: bool = False,
-    spaces: Sequence[str] | None = None,
+    node: Node, ids: Sequence[int], config: SwarmConfig, stop: Stop, space: str, spaces: Sequence[str],
+    shared: bool = False,
 ) -> None:  # fmt: skip
     """Declare the rest of the parameters and run agents until the end.
 
     :param ids: of the agents that live here, ascending.
     :param space: namespace of what the whole swarm shares.
+    :param spaces: namespace of each agent.
     :param shared: whether one table serves all.
-    :param spaces: namespace of each agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
     :raises ConfigError: for settings that are not usable.
     """
     if shared and not can_share_table(config):
         raise ConfigError("shared_table", True, f"false with policy {config.policy}")
     host = HostSettings(**declare_settings(node, HostSettings))
-    priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
     if host.mode == names.MODES[0]:
         agents: AgentsNode = SwarmNode(node, with_key(make_swarm(config, local=ids, shared_table=shared)), space)
     else:
-        agents = _realtime_node(node, config, ids, space, priority)
+        agents = _realtime_node(node, config, ids, space, host.priority)
     if host.odometry:
         agents.offer_odometry(spaces)
     logger = node.get_logger()
@@ -152,7 +145,8 @@ def _body(stop: Stop, supervised: bool) -> None:
     with ending(node):
         config = declare_swarm(node)
         ids = declare_ids(node, config.agents)
-        host_agents(node, ids, config, stop, space, declare_setting(node, _SHARED))
+        spaces = [names.agent_namespace(agent, space) for agent in ids]
+        host_agents(node, ids, config, stop, space, spaces, declare_setting(node, _SHARED))
 
 
 def main(args: Sequence[str] | None = None) -> int:
