@@ -47,7 +47,8 @@ class PacketReader:
             self._rest = b""
             return []
         data, self._rest = self._rest + data, b""
-        packets, at = [], 0
+        packets: list[RadioPacket] = []
+        at = 0
         while at < len(data) and _HEAD.size <= data[at] <= _HEAD.size + _LONGEST_PAYLOAD:
             end = at + data[at]
             if end > len(data):

@@ -13,23 +13,8 @@ from typing import Any
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.priority import realtime_thread
 
-from .crazyradio_packets import (
-    BROADCAST,
-    FIRST_FIRMWARE,
-    GET_SNIFFER_DROP_COUNT,
-    NORMAL,
-    SET_DATA_RATE,
-    SET_RADIO_ADDRESS,
-    SET_RADIO_CHANNEL,
-    SET_RADIO_MODE,
-    SNIFFER,
-    USB_PACKET,
-    VENDOR_IN,
-    VENDOR_OUT,
-    PacketReader,
-    broadcast,
-    datagram_in,
-)
+from . import crazyradio_packets as radio
+from .crazyradio_packets import PacketReader, broadcast, datagram_in
 from .device_port import FAULTS, DevicePort, reason
 from .settings import CrazyradioSettings
 
@@ -137,16 +122,18 @@ class CrazyradioPort(DevicePort):
                 raise ConfigError("uri", uri, f"a Crazyradio that is plugged in; there are {len(devices)}")
             device = matches[0]
             version = int(device.bcdDevice)
-            if version < FIRST_FIRMWARE:
+            if version < radio.FIRST_FIRMWARE:
                 firmware = f"{uri}: firmware {version >> 8:x}.{version & 0xFF:x}"
                 raise ConfigError("uri", firmware, "a Crazyradio 2.0 with firmware 5.4 or later: it has sniffer mode")
             device.set_configuration(1)
             usb.util.claim_interface(device, 0)
-            _request(device, SET_RADIO_MODE, NORMAL)  # it may have been left otherwise: begin with an empty queue
-            _request(device, SET_RADIO_CHANNEL, address.channel)
-            _request(device, SET_DATA_RATE, address.rate_mbps)
-            _request(device, SET_RADIO_ADDRESS, 0, BROADCAST)
-            _request(device, SET_RADIO_MODE, SNIFFER)
+            _request(
+                device, radio.SET_RADIO_MODE, radio.NORMAL
+            )  # it may have been left otherwise: begin with an empty queue
+            _request(device, radio.SET_RADIO_CHANNEL, address.channel)
+            _request(device, radio.SET_DATA_RATE, address.rate_mbps)
+            _request(device, radio.SET_RADIO_ADDRESS, 0, radio.BROADCAST)
+            _request(device, radio.SET_RADIO_MODE, radio.SNIFFER)
         except usb.core.NoBackendError:
             raise ConfigError("libusb", "not found", f"libusb 1.0: {_HOW}") from None
         except ConfigError:
@@ -164,14 +151,14 @@ class CrazyradioPort(DevicePort):
         import usb.util
 
         with contextlib.suppress(*FAULTS):
-            _request(device, SET_RADIO_MODE, NORMAL)
+            _request(device, radio.SET_RADIO_MODE, radio.NORMAL)
         usb.util.dispose_resources(device)
 
     def _write(self, device: Any, data: bytes) -> None:
         """Send a packet; when it leaves is not known."""
         transfer = broadcast(data, self._settings.p2p_port)
         device.write(_OUT, transfer, _WRITE_MS)
-        if not len(transfer) % USB_PACKET:
+        if not len(transfer) % radio.USB_PACKET:
             device.write(_OUT, b"", _WRITE_MS)
 
     def _read(self, device: Any) -> None:
@@ -182,7 +169,7 @@ class CrazyradioPort(DevicePort):
         while not self._stopped.is_set():
             data = b""
             with contextlib.suppress(usb.core.USBTimeoutError):
-                data = bytes(device.read(_IN, 2 * USB_PACKET, _READ_MS))
+                data = bytes(device.read(_IN, 2 * radio.USB_PACKET, _READ_MS))
             now = time.monotonic_ns()
             for packet in reader.feed(data):
                 arrival_ns = clock.arrival_ns(packet.stamp_us, now)
@@ -193,13 +180,15 @@ class CrazyradioPort(DevicePort):
                     self._queue(datagram, arrival_ns, False)
             if now >= counts_due_ns:
                 counts_due_ns = now + _COUNTS_NS
-                dropped = bytes(device.ctrl_transfer(VENDOR_IN, GET_SNIFFER_DROP_COUNT, 0, 0, 4, _REQUEST_MS))
+                dropped = bytes(
+                    device.ctrl_transfer(radio.VENDOR_IN, radio.GET_SNIFFER_DROP_COUNT, 0, 0, 4, _REQUEST_MS)
+                )
                 counts = int.from_bytes(dropped, "little"), reader.garbled, clock.unusable
                 self._dropped, self._garbled, self._unusable = map(sum, zip(before, counts, strict=True))
 
 
 def _request(device: Any, number: int, value: int, data: bytes = b"") -> None:
-    device.ctrl_transfer(VENDOR_OUT, number, value, 0, data, _REQUEST_MS)
+    device.ctrl_transfer(radio.VENDOR_OUT, number, value, 0, data, _REQUEST_MS)
 
 
 def _devices(simulated_radio: str) -> list[Any]:

@@ -21,7 +21,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -34,21 +34,15 @@ _SECOND = 1_000_000_000
 _MAGIC = b"DT\x01\x00"
 _WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic
 _TRUST_NS = 1_000_000
-_UNIT_NS = 10_000  # of times in the header
 
 
+@dataclass(frozen=True, slots=True)
 class ClockMap:
-    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift.
+    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift."""
 
-    :param offset_ns: by how much it is ahead at ``began_ns``, which is now if it is None.
-    :param drift_ppb: parts per billion by which it runs fast.
-    """
-
-    __slots__ = ("began_ns", "drift_ppb", "offset_ns")
-
-    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0, began_ns: int | None = None) -> None:
-        self.began_ns = time.monotonic_ns() if began_ns is None else began_ns
-        self.offset_ns, self.drift_ppb = offset_ns, drift_ppb
+    offset_ns: int = 0  # by how much it is ahead at `began_ns`
+    drift_ppb: int = 0  # parts per billion by which it runs fast
+    began_ns: int = field(default_factory=time.monotonic_ns)
 
     def local_ns(self, monotonic_ns: int) -> int:
         """What the clock shows at a time of CLOCK_MONOTONIC."""
@@ -71,6 +65,10 @@ class Header(NamedTuple):
     def size(self) -> int:
         """Bytes before the frame."""
         return sum(self)
+
+    def late_ns(self, datagram: bytes) -> int:
+        """How much later than its slot a datagram says to have left; 0 where it does not say."""
+        return int.from_bytes(datagram[self.agreed : self.agreed + self.late], "little") * 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,32 +166,21 @@ class PortSettings(Protocol):
     def to_dict(self) -> dict[str, Any]: ...
 
 
-#: Kinds of port by name, which `--air NAME` and the parameter ``air`` of a node choose from: module, port, settings.
-_PORTS = {
-    "udp": ("udp_port", "UdpPort", "UdpSettings"),
-    "crazyradio": ("crazyradio_port", "CrazyradioPort", "CrazyradioSettings"),
-    "serial": ("serial_port", "SerialPort", "SerialSettings"),
-}
-AIRS = tuple(_PORTS)
+#: Kinds of port, which `--air NAME` and the parameter ``air`` of a node choose from; they name modules and classes.
+AIRS = ("udp", "crazyradio", "serial")
 
 
 def settings_class(air: str) -> Any:
-    """Return the settings class of a kind of port; its objects are :class:`PortSettings`.
-
-    :raises ConfigError: if there is none of this name.
-    """
-    if air not in _PORTS:
+    """Return the settings class of a kind of port; ConfigError: there is none of this name."""
+    if air not in AIRS:
         raise ConfigError("air", air, ", ".join(AIRS))
-    return getattr(import_module("dtsa_agent.air.settings"), _PORTS[air][2])
+    return getattr(import_module("dtsa_agent.air.settings"), f"{air.capitalize()}Settings")
 
 
 def open_port(settings: PortSettings) -> Port:
-    """Return the port of an agent, or of a listener; only its module is imported.
-
-    :raises ConfigError: if it cannot be used.
-    """
-    module, cls, _ = _PORTS[settings.properties.name]
-    port: Port = getattr(import_module(f"dtsa_agent.air.{module}"), cls)(settings)
+    """Return the port of an agent, or of a listener; only its module is imported. ConfigError: it cannot be used."""
+    air = settings.properties.name
+    port: Port = getattr(import_module(f"dtsa_agent.air.{air}_port"), f"{air.capitalize()}Port")(settings)
     return port
 
 
@@ -205,11 +192,6 @@ def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
     """From the order to send a frame to its arrival, as agents take it to be, ns."""
     length = port.header(config.auth).size + config.frame_length
     return port.flight_time_ns + port.byte_time_ns * length + port.turn_ns * config.agents // 2  # half a round
-
-
-def lateness_ns(datagram: bytes, header: Header) -> int:
-    """How much later than its slot a datagram says to have left; 0 where it does not say."""
-    return int.from_bytes(datagram[header.agreed : header.agreed + header.late], "little") * _UNIT_NS
 
 
 def shortest_slot_ns(config: SwarmConfig, port: PortProperties) -> int:

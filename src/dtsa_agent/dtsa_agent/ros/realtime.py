@@ -1,16 +1,13 @@
 """Agents on their own clocks: no agent waits for another, and a frame that is late is late.
 
-How a flight in real time works ("channel": `dtsa_channel_sim/ros`):
-
-1. **The time line.** The channel calls all processes, then sends START with the time of slot 0 on CLOCK_MONOTONIC.
-   Slot T lies at T slot lengths after it. Each agent has a clock of its own, off by an offset and a drift.
-2. **A slot here.** Each agent is a station (`core/station`) that says when it is due. It ends the slot before, decides,
-   and gives the frame to send. That is published with the time at which its transmission starts, mostly some time
-   ahead; then the vehicles move. A frame that would leave half a slot late is not sent.
-3. **On the air.** The channel finds a frame's receivers by reach, overlap and losses, and delivers it to all processes.
-   The stations whose bits are set receive it; the time of its arrival moves their slots.
-4. **Reported.** Some ten times a second a process reports what its agents decided, received and flew (`reporter`).
-   Recorder, metrics and live view get what agents had, not what they should have had.
+1. **Time.** The channel calls all processes, then sends START with the time of slot 0 on CLOCK_MONOTONIC. Slot T lies
+   T slot lengths after it. Each agent has a clock of its own, off by an offset and a drift.
+2. **A slot.** Each agent is a station (`core/station`) that says when it is due, decides, and gives the frame to send.
+   That is published with the time at which its transmission starts, mostly some time ahead; then the vehicles move.
+   A frame that would leave half a slot late is not sent.
+3. **The air.** The channel finds a frame's receivers and delivers it to all processes. The stations whose bits are set
+   receive it; the time of its arrival moves their slots.
+4. **Reports.** Some ten times a second a process reports what its agents decided, received and flew (`reporter`).
 5. **Coming and going.** A late agent listens, takes the time from the first frame that it hears, and hovers until the
    others know it. One that gets a signal announces in its own turns that it leaves, and ends then.
 """
@@ -30,23 +27,12 @@ from rclpy.node import Node
 
 from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core import station as core
 from dtsa_agent.core.agent import REFUSED
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator
-from dtsa_agent.core.station import (
-    KEEPS_NOTHING,
-    KEEPS_NUMBERS,
-    KEEPS_STARTS,
-    LENGTH,
-    NO_FRAME,
-    REJECTED,
-    REPEATED,
-    Link,
-    Station,
-    StationSettings,
-    check_joinable,
-)
+from dtsa_agent.core.station import Link, Station, StationSettings
 from dtsa_agent.core.swarm import PRESENT_LEAVING
 from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
@@ -72,7 +58,7 @@ class RealtimeAgent:
     All times but the station's own are ns on the channel's time line, from the start of slot 0; for the clock,
     CLOCK_MONOTONIC stands for it.
 
-    :param index: place among the agents here, for the reporter.
+    :param index: place among the agents here.
     :param jitter_ns: standard deviation of the time of a single transmission.
     """
 
@@ -152,7 +138,7 @@ class RealtimeAgent:
             self.refusals[""] += 1
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
-        if fault != REPEATED:  # it has it
+        if fault != core.REPEATED:  # it has it
             self.refusals[fault] += 1
 
 
@@ -216,7 +202,7 @@ class RealtimeNode(AgentsNode):
         most: Counter[str] = Counter()  # a frame that several agents have refused counts once
         for agent in self.agents:
             most |= agent.refusals
-        malformed, rejected = most[LENGTH] + most[NO_FRAME], most[REJECTED]
+        malformed, rejected = most[core.LENGTH] + most[core.NO_FRAME], most[core.REJECTED]
         return {
             "frame malformed": malformed + max(agent.swarm.malformed for agent in self.agents),
             "frame foreign": most.total() - most[""] - malformed - rejected
@@ -286,11 +272,8 @@ class RealtimeNode(AgentsNode):
             self._priority = 0
 
     def _may_join(self) -> bool:
-        """Whether the channel has found all that this process publishes: what is published before is lost.
-
-        :raises ConfigError: with a policy whose tables all have to be equal.
-        """
-        check_joinable(self.config.policy)
+        """Whether the channel has found all that this process publishes: what is published before is lost."""
+        core.check_joinable(self.config.policy)
         return self.membership.is_connected() and all(p.get_subscription_count() for p in (self._air, self._telemetry))
 
     def _begin(self, run: int, zero: int) -> None:
@@ -299,12 +282,14 @@ class RealtimeNode(AgentsNode):
         self._zero = zero
         if self._authenticator is not None and not self.config.auth_session:
             self._authenticator.begin(self.membership.session)
-        keeps = KEEPS_NUMBERS if self._called else KEEPS_NOTHING  # the channel has said what time it is, or not
+        keeps = (
+            core.KEEPS_NUMBERS if self._called else core.KEEPS_NOTHING
+        )  # the channel has said what time it is, or not
         link = Link(b"", says_late=False, names=0, flight_ns=self._flight_ns, trust_ns=_TRUST_NS)
         for agent in self.agents:
             settings = StationSettings(
                 self.config, link, self._authenticator, agent.id, origin_ns=0, listens=not self._called,
-                keeps_time=keeps if self._align else KEEPS_STARTS,
+                keeps_time=keeps if self._align else core.KEEPS_STARTS,
             )  # fmt: skip
             agent.begin(settings, zero)
         for agent, place in zip(self.agents, self._resume_at if not self._called else (), strict=False):

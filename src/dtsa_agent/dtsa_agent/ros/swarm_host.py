@@ -15,7 +15,7 @@ from rclpy.node import Node
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
-from dtsa_agent.core.settings.declaration import Setting, Settings, setting
+from dtsa_agent.core.settings.declaration import Setting, setting
 from dtsa_agent.keys import authenticator, with_key
 from dtsa_agent.priority import PrioritySettings, set_nice
 from dtsa_agent.ros.common import names
@@ -47,19 +47,13 @@ class HostSettings(PrioritySettings):
         names.MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own",
         choices=names.MODES,
     )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class RealtimeSettings(Settings):
-    """What the agents of a process have in common in real time."""
-
     clock_jitter_ns: float = setting(
-        0.0, "standard deviation of the time of one transmission", unit="ns", minimum=0, maximum=1e9
+        0.0, "in real time: standard deviation of the time of one transmission", unit="ns", minimum=0, maximum=1e9
     )
-    align: bool = setting(True, "agents move their slots towards what they hear")
+    align: bool = setting(True, "in real time: agents move their slots towards what they hear")
     nice: int = setting(
-        0, "without real-time priority: by how much this process gives way to others, the channel above all: nice",
-        minimum=0, maximum=19,
+        0, "in real time, without real-time priority: by how much this process gives way to others, the channel above "
+        "all: nice", minimum=0, maximum=19,
     )  # fmt: skip
 
 
@@ -95,7 +89,7 @@ def host_agents(
     if host.mode == names.MODES[0]:
         agents: AgentsNode = SwarmNode(node, with_key(make_swarm(config, local=ids, shared_table=shared)), space)
     else:
-        agents = _realtime_node(node, config, ids, space, host.priority)
+        agents = _realtime_node(node, config, ids, space, host)
     if host.odometry:
         agents.offer_odometry(spaces)
     logger = node.get_logger()
@@ -111,7 +105,7 @@ def host_agents(
         agents.loop.close()
 
 
-def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, priority: int) -> AgentsNode:
+def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, host: HostSettings) -> AgentsNode:
     from .realtime import ClockMap, RealtimeNode
 
     def declare_numbers(name: str, count: int, text: str) -> list[int]:
@@ -124,18 +118,17 @@ def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: s
     text = "offset of each agent's clock at the start, one for all or one an agent; positive: early (ns)"
     offset = declare_numbers("clock_offset_ns", count, text)
     drift = declare_numbers("clock_drift_ppb", count, "by how much each agent's clock runs fast (parts per billion)")
-    own = RealtimeSettings(**declare_settings(node, RealtimeSettings))
     text = "from the order to send until a receiver has the frame: for any frame, and more for each of its bytes (ns)"
     fixed, per_byte = declare_numbers("flight_time_ns", 2, text)
     text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
     places = declare_list(node, "resume_at", [0.0], text)
     if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):
         raise ConfigError("resume_at", places, f"{3 * count} numbers with a decimal point: x, y, z of each agent")
-    if own.nice:
-        set_nice(own.nice)
+    if host.nice:
+        set_nice(host.nice)
     return RealtimeNode(
-        node, config, ids, space, authenticator=authenticator(config), jitter_ns=own.clock_jitter_ns, align=own.align,
-        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)], priority=priority,
+        node, config, ids, space, authenticator=authenticator(config), jitter_ns=host.clock_jitter_ns, align=host.align,
+        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)], priority=host.priority,
         flight_time_ns=fixed + per_byte * config.frame_length, resume_at=places if len(places) > 1 else (),
     )  # fmt: skip
 

@@ -44,12 +44,6 @@ class _NoExecutor(CallbackGroup):
     def can_execute(self, entity: Any) -> bool:
         return False
 
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
-
 
 # Who sent a message: rclpy knows, but hands it out with no message. So one function of rcl is called through ctypes,
 # with the message information that it fills in. With another middleware or distribution there is no sender.
@@ -223,6 +217,7 @@ class Loop(Feed):
             if self._executor is None:
                 self._executor = SingleThreadedExecutor(context=self._node.context)
                 self._executor.add_node(self._node)
+                self._stack.callback(self._executor.shutdown, timeout_sec=0)
             for _ in range(2):
                 self._executor.spin_once(timeout_sec=0.0)
         return True
@@ -237,12 +232,6 @@ class Loop(Feed):
                 idle()
             if not self._node.context.ok():
                 raise ExternalShutdownException
-
-    def close(self) -> None:
-        """Give the handles back."""
-        if self._executor is not None:
-            self._executor.shutdown(timeout_sec=0)
-        super().close()
 
 
 class ExecutorThread:
