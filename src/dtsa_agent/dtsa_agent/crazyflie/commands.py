@@ -17,16 +17,18 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .safety import SafetySettings, outside_fence
 from .state import Quaternion, Vector, to_world
+
+if TYPE_CHECKING:
+    from .vehicle import CrazyflieVehicle
 
 VELOCITY_WORLD, POSITION, FULL_STATE = "velocity_world", "position", "full_state"
 FULL_STATE_LIMIT = 32.767  # m, m/s, m/s^2, rad/s: 16 bit numbers in thousandths
 MAX_CLOCK_S = 0.1  # a sender's clock that is wrong makes a command at most so much older
 _POLL_NS = 100_000_000  # the end is noticed after this time at the latest
-_BURST = 4  # messages taken from one topic in one round; only the latest one counts anyway
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,58 +95,48 @@ def of_message(kind: str, m: Any, origin: Vector, stamp: float) -> Setpoint:
     return full_state(place, (v.x, v.y, v.z), (a.x, a.y, a.z), (q.x, q.y, q.z, q.w), (w.x, w.y, w.z), stamp)
 
 
-def check_stream(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> None:
-    """Refuse a streamed command that leads out of the room, or is too fast; ValueError: why it is refused."""
+def why_refused(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> str:
+    """Return why a streamed command is refused: it leads out of the room, or is too fast; empty if it is not."""
     if setpoint.speed > fastest_mps:
         limit = f"(station.max_stream_mps is {fastest_mps:g})"
-        raise ValueError(f"a command with {setpoint.speed:.2f} m/s is refused {limit}")
-    if setpoint.place is not None and (problem := outside_fence(setpoint.place, safety, origin)):
-        raise ValueError(f"a command to {problem} is refused")
+        return f"a command with {setpoint.speed:.2f} m/s is refused {limit}"
+    outside = outside_fence(setpoint.place, safety, origin) if setpoint.place is not None else ""
+    return f"a command to {outside} is refused" if outside else ""
 
 
-class CommandInput:
-    """Takes the messages of one topic of one vehicle.
-
-    :param controls: the vehicle's `Controls`.
-    :param station: the station's settings.
-    :param warn: called with a line about a command that does not count, at a limited rate.
-    """
-
-    def __init__(self, kind: str, controls: Any, station: Any, name: str, warn: Callable[[str], None]) -> None:
-        self._kind, self._controls, self._station, self._name, self._warn = kind, controls, station, name, warn
-
-    def __call__(self, message: Any, info: Any) -> None:
-        station = self._station
-        # The command is as old as its publication.
-        age = (time.time_ns() - info["source_timestamp"]) * 1e-9
-        stamp = time.monotonic() - min(max(age, 0.0), MAX_CLOCK_S)
-        try:
-            setpoint = of_message(self._kind, message, station.room_origin_in_world, stamp)
-            check_stream(setpoint, station.safety, station.room_origin_in_world, station.max_stream_mps)
-        except ValueError as error:
-            self._controls.refused += 1
-            self._warn(f"{self._name}: {error}")
-            return
-        if not self._controls.command(setpoint):
-            self._warn(f"{self._name}: commands are not accepted now ({self._controls.state_text})")
+def read_command(kind: str, vehicle: CrazyflieVehicle, message: Any, published: float) -> str:
+    """Give a message (see `of_message`), published at a Unix time (s), to its vehicle; return why it does not count."""
+    station = vehicle.station
+    stamp = time.monotonic() - min(max(time.time() - published, 0.0), MAX_CLOCK_S)  # as old as its publication
+    try:
+        setpoint = of_message(kind, message, station.room_origin_in_world, stamp)
+    except ValueError as error:
+        problem = str(error)
+    else:
+        problem = why_refused(setpoint, station.safety, station.room_origin_in_world, station.max_stream_mps)
+    if problem:
+        vehicle.refused += 1
+    elif not vehicle.command(setpoint):
+        problem = f"commands are not accepted now ({vehicle.state.name.lower()}: {vehicle.machine.reason})"
+    return problem and f"{vehicle.name}: {problem}"
 
 
-class CommandThread:
-    """Takes messages and calls back, in its own thread.
+class TopicThread:
+    """Takes the newest messages of topics and calls back, in its own thread.
 
     :param node: subscribes; must not be in an executor.
     """
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node: Any, name: str) -> None:
         self._node = node
-        self._subscriptions: list[tuple[Any, type, Callable[[Any, Any], None]]] = []
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="commands", daemon=True)
+        self._subscriptions: list[tuple[Any, type, Callable[[Any, float], None]]] = []
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
-    def subscribe(self, kind: type, topic: str, callback: Callable[[Any, Any], None], qos: Any) -> None:
+    def subscribe(self, kind: type, topic: str, callback: Callable[[Any, float], None], qos: Any) -> None:
         """Before `start`: take the messages of a topic.
 
-        :param callback: gets a message and its information (`source_timestamp` in ns).
+        :param callback: gets a message, and when it was published (s, Unix time).
         """
         subscription = self._node.create_subscription(kind, topic, lambda message: None, qos)
         self._subscriptions.append((subscription.handle, kind, callback))
@@ -156,7 +148,7 @@ class CommandThread:
 
     def close(self) -> None:
         """End of the thread and its node."""
-        self._over.set()
+        self._closing.set()
         if self._thread.is_alive():
             self._thread.join(2.0)
         self._node.destroy_node()
@@ -169,23 +161,13 @@ class CommandThread:
             for handle in (context, *(handle for handle, _, _ in self._subscriptions)):
                 stack.enter_context(handle)
             wait_set = _rclpy.WaitSet(len(self._subscriptions), 0, 0, 0, 0, 0, context)
-            while not self._over.is_set() and self._node.context.ok():
+            while not self._closing.is_set() and self._node.context.ok():
                 wait_set.clear_entities()
                 for handle, _, _ in self._subscriptions:
                     wait_set.add_subscription(handle)
                 wait_set.wait(_POLL_NS)
                 ready = set(wait_set.get_ready_entities("subscription"))
                 for handle, kind, callback in self._subscriptions:
-                    if handle.pointer in ready:
-                        self._drain(handle, kind, callback)
-
-    @staticmethod
-    def _drain(handle: Any, kind: type, callback: Callable[[Any, Any], None]) -> None:
-        latest = None
-        for _ in range(_BURST):
-            taken = handle.take_message(kind, False)
-            if taken is None:
-                break
-            latest = taken
-        if latest is not None:
-            callback(*latest)
+                    taken = handle.take_message(kind, False) if handle.pointer in ready else None
+                    if taken is not None:
+                        callback(taken[0], taken[1]["source_timestamp"] * 1e-9)

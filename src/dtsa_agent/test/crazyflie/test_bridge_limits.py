@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.controls import PEAK, shortest_s, too_short
+from dtsa_agent.crazyflie.orders import PEAK, shortest_s, too_short
 
 
 def test_the_shortest_duration_keeps_the_speed_of_the_firmwares_path() -> None:
@@ -52,7 +52,7 @@ def test_what_is_too_short_is_refused_and_motors_never_stop_between_a_stream_and
 
             def stream() -> None:
                 for _ in range(10):
-                    assert cf.controls.command(velocity_world((0.1, 0.0, 0.0), 0.0, time.monotonic()))
+                    assert cf.command(velocity_world((0.1, 0.0, 0.0), 0.0, time.monotonic()))
                     time.sleep(0.05)
 
             def reaches(height: float) -> None:
