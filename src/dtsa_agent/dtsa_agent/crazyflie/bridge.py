@@ -23,8 +23,8 @@ from .link import SIMULATED_RADIO, require_cflib
 from .onboard import OnboardSetup, app_orders, app_parameters, key_of
 from .safety import Action, RequiredAction, SafetyMonitor
 from .settings import SwarmSettings
-from .state import State, VehicleState
-from .vehicle import OFF, WATCHED_OVER, CrazyflieVehicle
+from .state import OFF, WATCHED_OVER, State, VehicleState
+from .vehicle import CrazyflieVehicle
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that

@@ -13,21 +13,16 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from .safety import SafetySettings, outside_fence
 from .state import Quaternion, Vector, to_world
 
-if TYPE_CHECKING:
-    from .vehicle import CrazyflieVehicle
-
 VELOCITY_WORLD, POSITION, FULL_STATE = "velocity_world", "position", "full_state"
 FULL_STATE_LIMIT = 32.767  # m, m/s, m/s^2, rad/s: 16 bit numbers in thousandths
-MAX_CLOCK_S = 0.1  # a sender's clock that is wrong makes a command at most so much older
 _POLL_NS = 100_000_000  # the end is noticed after this time at the latest
 
 
@@ -95,30 +90,13 @@ def of_message(kind: str, m: Any, origin: Vector, stamp: float) -> Setpoint:
     return full_state(place, (v.x, v.y, v.z), (a.x, a.y, a.z), (q.x, q.y, q.z, q.w), (w.x, w.y, w.z), stamp)
 
 
-def why_refused(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> str:
-    """Return why a streamed command is refused: it leads out of the room, or is too fast; empty if it is not."""
+def check_setpoint(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> None:
+    """Refuse a streamed command that leads out of the room, or is too fast; ValueError: why it is refused."""
     if setpoint.speed > fastest_mps:
         limit = f"(station.max_stream_mps is {fastest_mps:g})"
-        return f"a command with {setpoint.speed:.2f} m/s is refused {limit}"
-    outside = outside_fence(setpoint.place, safety, origin) if setpoint.place is not None else ""
-    return f"a command to {outside} is refused" if outside else ""
-
-
-def read_command(kind: str, vehicle: CrazyflieVehicle, message: Any, published: float) -> str:
-    """Give a message (see `of_message`), published at a Unix time (s), to its vehicle; return why it does not count."""
-    station = vehicle.station
-    stamp = time.monotonic() - min(max(time.time() - published, 0.0), MAX_CLOCK_S)  # as old as its publication
-    try:
-        setpoint = of_message(kind, message, station.room_origin_in_world, stamp)
-    except ValueError as error:
-        problem = str(error)
-    else:
-        problem = why_refused(setpoint, station.safety, station.room_origin_in_world, station.max_stream_mps)
-    if problem:
-        vehicle.refused += 1
-    elif not vehicle.command(setpoint):
-        problem = f"commands are not accepted now ({vehicle.state.name.lower()}: {vehicle.machine.reason})"
-    return problem and f"{vehicle.name}: {problem}"
+        raise ValueError(f"a command with {setpoint.speed:.2f} m/s is refused {limit}")
+    if setpoint.place is not None and (problem := outside_fence(setpoint.place, safety, origin)):
+        raise ValueError(f"a command to {problem} is refused")
 
 
 class TopicThread:

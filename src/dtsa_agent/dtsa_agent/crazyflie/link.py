@@ -22,7 +22,7 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 
-from .addresses import LinkCounters, LinkError
+from .addresses import LinkError
 from .commands import Setpoint
 from .onboard import START, OnboardSetup, send_order
 from .positions import SettlingCheck
@@ -108,8 +108,8 @@ class CrazyflieLink:
     ) -> None:  # fmt: skip
         self.robot = robot
         self.connected = False
-        self.received = 0  # log packets
-        self.counters = LinkCounters()
+        self.sent = self.received = 0  # packets, and log packets
+        self.acknowledged = -math.inf  # s, monotonic: when anything last came, or was acknowledged
         self.firmware: tuple[int, str] | None = None  # version of its protocol, and revision; None: never connected
         self.board: OnboardSetup | None = None  # what the app on board is told; None: there is none
         self.guarded = False  # the firmware's emergency watchdog wants to be fed as soon as it can be
@@ -118,7 +118,7 @@ class CrazyflieLink:
         self._on_state, self._on_broken, self._on_answer = on_state, on_broken, on_answer
         self._closed = False
         self._cf: Any = None
-        self._driver: Any = None  # ours; None: one of cflib's own
+        self.driver: Any = None  # over a radio ours, which knows its quality (0 to 1) and rssi (-dBm)
         self._settled, self._failure = threading.Event(), ""  # of the present attempt to connect
         self._stamp = 0.0  # s, monotonic, of the last streamed command
         self._log_clock, self._logged = LogClock(), threading.Event()
@@ -137,7 +137,7 @@ class CrazyflieLink:
         if (cf := self.crazyflie) is not None:
             self._stamp = setpoint.stamp
             getattr(cf.commander, f"send_{setpoint.kind}_setpoint")(*setpoint.arguments)
-            if self._driver is None:
+            if self.driver is None:
                 self._count_setpoint()
 
     def _count_setpoint(self) -> None:
@@ -172,9 +172,11 @@ class CrazyflieLink:
     def parameters(self) -> dict[str, tuple[Any, float]]:
         """Return the firmware's parameters by `group.name`: cflib's entry in its table, and the value as last read."""
         found: dict[str, tuple[Any, float]] = {}
-        param = None if self.crazyflie is None else self.crazyflie.param
-        for group, values in dict(param.values if param else {}).items():
-            for name, text in dict(values).items():
+        if (cf := self.crazyflie) is None:
+            return found
+        param = cf.param
+        for group, values in param.values.copy().items():
+            for name, text in values.copy().items():
                 element, full_name = param.toc.toc[group][name], f"{group}.{name}"
                 read = int(text) if element.pytype[-1] in INTEGERS else float(text)
                 # A value that was set after connecting is newer than cflib's copy.
@@ -212,13 +214,11 @@ class CrazyflieLink:
         cf = self._cf = Crazyflie(rw_cache=str(self._cache))
         self._watch(cf)
         cf.open_link(self.robot.uri)
-        if hasattr(cf.link, "counters"):  # one of our drivers
-            self._driver = cf.link
-            cf.link.counters.sent += self.counters.sent
-            self.counters = cf.link.counters
-            cf.link.on_silence_end, cf.link.on_setpoint_sent = self._end_silence, self._count_setpoint
+        if hasattr(cf.link, "on_acknowledged"):  # one of our drivers
+            self.driver = cf.link
+            cf.link.on_acknowledged, cf.link.on_setpoint_sent = self._acknowledge, self._count_setpoint
         settled = self._settled.wait(min(FIRST_ANSWER_S, limit))
-        if self.robot.address.radio and not settled and self.counters.acknowledged == -math.inf:
+        if self.robot.address.radio and not settled and self.acknowledged == -math.inf:
             raise LinkError(f"no answer on the air within {FIRST_ANSWER_S:g} s")
         if not self._settled.wait(max(0.0, deadline - time.monotonic())):
             raise LinkError(f"no answer within {limit:g} s")
@@ -262,9 +262,12 @@ class CrazyflieLink:
                 self.connected = False
                 self._on_broken(f"link broken: {reason}")
 
+        def sent(packet: Any) -> None:
+            self.sent += 1
+
         def received(packet: Any) -> None:
-            if self._driver is None:
-                self.counters.acknowledged = time.monotonic()
+            if self.driver is None:
+                self._acknowledge()
 
         def answered(packet: Any) -> None:
             if len(packet.data) > 3:
@@ -273,14 +276,17 @@ class CrazyflieLink:
         cf.fully_connected.add_callback(lambda uri: self._settled.set())
         cf.connection_failed.add_callback(broken)
         cf.connection_lost.add_callback(broken)
+        cf.packet_sent.add_callback(sent)
         cf.packet_received.add_callback(received)
         cf.add_port_callback(CRTPPort.SETPOINT_HL, answered)
 
-    def _end_silence(self) -> None:
-        """The end of a silence: the firmware's watchdog has not much time left."""
-        self._audible_since = time.monotonic()
-        if self.guarded:
-            self.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
+    def _acknowledge(self) -> None:
+        """Something came, or was acknowledged; at the end of a silence the firmware's watchdog has little time left."""
+        silent, self.acknowledged = time.monotonic() - self.acknowledged > AUDIBLE_S, time.monotonic()
+        if silent:
+            self._audible_since = self.acknowledged
+            if self.guarded:
+                self.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
 
     def _reset_estimator(self, cf: Any) -> None:
         """Restart the Kalman filter, and wait until it knows where it stands; positions are sent meanwhile.
@@ -331,8 +337,8 @@ class CrazyflieLink:
             send_order(cf, START)
         except LinkError as error:
             return str(error)
-        if self._driver is not None:
-            self._driver.limit(board.polls_hz)
+        if self.driver is not None:
+            self.driver.limit(board.polls_hz)
             # An order takes some packets of each way, and the log comes seldom.
             self._log_order_s = LOG_ORDER_S + 1.0 / self.robot.log_rate_hz + 5.0 / board.polls_hz
         return ""
@@ -361,7 +367,7 @@ class CrazyflieLink:
     def order_log(self, now: float) -> None:
         """Order the log anew, if it can be heard now (s, monotonic): the firmware ends it in a gap of a second."""
         last = max(self._log_clock.last, self._audible_since, self._log_ordered)
-        if now - self.counters.acknowledged > AUDIBLE_S or now - last < self._log_order_s:
+        if now - self.acknowledged > AUDIBLE_S or now - last < self._log_order_s:
             return
         self._log_ordered = now
 
@@ -380,7 +386,7 @@ class CrazyflieLink:
         if cf is not None:
             with contextlib.suppress(Exception):  # whatever state it is in, we are done with it
                 cf.close_link()
-        self._driver, self.counters = None, LinkCounters(sent=self.counters.sent)
+        self.driver, self.acknowledged = None, -math.inf
 
     def close(self) -> None:
         """Close the connection. Never in flight."""

@@ -130,6 +130,8 @@ class State(enum.IntEnum):
 
 CONNECTED = frozenset({State.READY, State.ARMED, State.FLYING, State.LANDING, State.EMERGENCY})
 IN_AIR = frozenset({State.FLYING, State.LANDING})
+OFF = frozenset({State.DISCONNECTED, State.CONNECTING})
+WATCHED_OVER = frozenset({State.ARMED, *IN_AIR})
 
 
 class StateMachine:
@@ -152,7 +154,7 @@ class StateMachine:
         if state == self.state:
             return
         before, self.state, self.reason = self.state, state, reason
-        if state in (State.CONNECTING, State.DISCONNECTED):
+        if state in OFF:
             self._landing = self._stopped = self._arming_ordered = False
         self._on_change(before, state, reason)
 
@@ -176,7 +178,7 @@ class StateMachine:
     def note_emergency_stop(self, reason: str) -> None:
         """Note that an emergency stop was ordered."""
         self._stopped = True
-        if self.state not in (State.DISCONNECTED, State.CONNECTING):
+        if self.state not in OFF:
             self.enter(State.EMERGENCY, reason)
 
     def note_lost_link(self, reason: str) -> None:

@@ -34,7 +34,20 @@ from .orders import GO_TO, LAND, REPEAT_S, TAKEOFF, RepeatedOrder, end_of_stream
 from .positions import PoseTracker, SettlingCheck, quantile
 from .safety import EstimateWatch, WatchedVehicle, outside_fence
 from .settings import GroundStationSettings, RobotSettings
-from .state import HL_ACTIVE, IN_AIR, IS_FLYING, Quaternion, State, StateMachine, Vector, VehicleState, to_map, yaw_of
+from .state import (
+    HL_ACTIVE,
+    IN_AIR,
+    IS_FLYING,
+    OFF,
+    WATCHED_OVER,
+    Quaternion,
+    State,
+    StateMachine,
+    Vector,
+    VehicleState,
+    to_map,
+    yaw_of,
+)
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
@@ -52,8 +65,6 @@ SINK_MPS = 0.3  # of a vehicle that does not know where it is
 SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
 BLIND_REPEAT_S, BLIND_REPEATS = 0.5, 3  # a landing that may not have been heard is ordered again
 BLIND_LAND_S = 2.0
-OFF = frozenset({State.DISCONNECTED, State.CONNECTING})
-WATCHED_OVER = frozenset({State.ARMED, State.FLYING, State.LANDING})
 ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
 
 
@@ -82,7 +93,7 @@ class CrazyflieVehicle:
         safety, positions, origin = station.safety, station.positions, station.room_origin_in_world
         room = (safety.geofence_min, safety.geofence_max) if safety.geofence else None
         self.tracker = PoseTracker(positions, origin, room) if positions.enabled else None  # None: no motion capture
-        self._watch = EstimateWatch(safety.estimate_jump_m, safety.estimate_freeze_s, safety.estimate_error_m)
+        self._watch = EstimateWatch(safety)
         agree_m = positions.agree_m if positions.enabled else None
         self.link = CrazyflieLink(
             robot, cache, self._on_state, self._on_broken, self._on_answer,
@@ -208,7 +219,7 @@ class CrazyflieVehicle:
     def link_quality(self, now: float) -> float:
         """Share of the log packets that arrive, or of packets that the radio need not repeat, 0 to 1."""
         recent = sum(now - t <= WINDOW_S for t in self._log_times.copy())
-        return min(1.0, recent / (self.robot.log_rate_hz * WINDOW_S), self.link.counters.quality)
+        return min(1.0, recent / (self.robot.log_rate_hz * WINDOW_S), getattr(self.link.driver, "quality", 1.0))
 
     def command_rate(self, now: float) -> tuple[float, float]:
         """Return streamed commands sent per second, and the 99th percentile of their latency, s."""

@@ -19,7 +19,7 @@ from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.positions import POSES_AFTER_JUMP, PoseTracker, PositionSettings, SettlingCheck, quantile
-from dtsa_agent.crazyflie.safety import EstimateWatch
+from dtsa_agent.crazyflie.safety import EstimateWatch, SafetySettings
 from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_agent.crazyflie.state import VehicleState
 
@@ -184,7 +184,7 @@ def test_an_estimate_that_wanders_has_not_settled() -> None:
 def flown(
     positions: Any, velocity: Any = (0.0, 0.0, 0.0), seen: Any = None, flying: bool = True, period: float = 0.02
 ) -> EstimateWatch:
-    watch = EstimateWatch(0.5, 0.5, 0.4)
+    watch = EstimateWatch(SafetySettings())
     for k, place in enumerate(positions):
         watch.update(VehicleState(place, velocity, LEVEL, 4.0, 0), period * k, seen, flying=flying)
     return watch

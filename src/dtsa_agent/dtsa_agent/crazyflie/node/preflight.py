@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.positions import quantile
 from dtsa_agent.crazyflie.safety import outside_fence
-from dtsa_agent.crazyflie.state import State, VehicleState, place_text
-from dtsa_agent.crazyflie.vehicle import OFF, CrazyflieVehicle
+from dtsa_agent.crazyflie.state import OFF, State, VehicleState, place_text
+from dtsa_agent.crazyflie.vehicle import CrazyflieVehicle
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 MAX_START_OFFSET_M = 0.25  # a vehicle farther from its initial_position is reported

@@ -26,11 +26,11 @@ from std_srvs.srv import Empty, SetBool, Trigger
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.commands import FULL_STATE, POSITION, VELOCITY_WORLD, TopicThread, read_command
+from dtsa_agent.crazyflie.commands import FULL_STATE, POSITION, VELOCITY_WORLD, TopicThread, check_setpoint, of_message
 from dtsa_agent.crazyflie.positions import NAMED_POSES, PoseTracker, PositionSettings, quantile
 from dtsa_agent.crazyflie.settings import SwarmSettings
-from dtsa_agent.crazyflie.state import State, VehicleState, place_text, rotate_inverse
-from dtsa_agent.crazyflie.vehicle import OFF, CrazyflieVehicle
+from dtsa_agent.crazyflie.state import OFF, State, VehicleState, place_text, rotate_inverse
+from dtsa_agent.crazyflie.vehicle import CrazyflieVehicle
 from dtsa_agent.ros.common.cdr import UNKNOWN, diagonal
 
 from . import interfaces
@@ -44,6 +44,7 @@ SENSOR = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LEVELS = {"info": 20, "warn": 30, "error": 40}
 ARMED_S, ARMED_POLL_S = 3.0, 0.02  # longest wait for motors that are to run, or to be locked
 LOW_POWER = 3  # pm_state
+MAX_CLOCK_S = 0.1  # a sender's clock that is wrong makes a command at most so much older
 # The firmware logs no variances: standard deviations of 3 cm, 0.1 rad and 0.1 m/s are cautious for its estimator with a
 # positioning system. Body rates are not logged.
 POSE_COVARIANCE = diagonal(0.03**2, 0.1**2)
@@ -114,8 +115,20 @@ class BridgeInputs:
             self._node.create_service(kind, name, order, callback_group=group)
 
     def _stream(self, kind: str, vehicle: CrazyflieVehicle, message: Any, published: float) -> None:
-        if problem := read_command(kind, vehicle, message, published):
-            self._node.get_logger().warning(problem, throttle_duration_sec=1.0)
+        """Give a message, published at a Unix time (s), to its vehicle, and say why it does not count."""
+        station = vehicle.station
+        origin = station.room_origin_in_world
+        stamp = time.monotonic() - min(max(time.time() - published, 0.0), MAX_CLOCK_S)  # as old as its publication
+        try:
+            setpoint = of_message(kind, message, origin, stamp)
+            check_setpoint(setpoint, station.safety, origin, station.max_stream_mps)
+        except ValueError as error:
+            vehicle.refused, problem = vehicle.refused + 1, str(error)
+        else:
+            reason = f"{vehicle.state.name.lower()}: {vehicle.machine.reason}"
+            problem = "" if vehicle.command(setpoint) else f"commands are not accepted now ({reason})"
+        if problem:
+            self._node.get_logger().warning(f"{vehicle.name}: {problem}", throttle_duration_sec=1.0)
 
     async def _ordered(self, name: str, callback: Callable[[Any], Any], request: Any, response: Any) -> Any:
         """Carry out an order, and say so: what an operator did belongs to what happened."""
@@ -344,7 +357,7 @@ def state_message(vehicle: CrazyflieVehicle, stamp: Any) -> StateMessage:
     log_age, command_age = (a if math.isfinite(a) else -1.0 for a in (vehicle.log_age(now), vehicle.command_age(now)))
     message = StateMessage(
         supervisor_info=last.info & 0xFFFF if last else 0, battery_voltage=last.battery if last else 0.0,
-        rssi=link.counters.rssi, link_quality=vehicle.link_quality(now), num_tx_unicast=link.counters.sent,
+        rssi=getattr(link.driver, "rssi", 0), link_quality=vehicle.link_quality(now), num_tx_unicast=link.sent,
         num_rx_unicast=link.received, latency_ms=vehicle.command_rate(now)[1] * 1000, log_age=log_age,
         command_age=command_age, state=int(vehicle.state), state_name=vehicle.state.name.lower(), reason=vehicle.action,
     )  # fmt: skip
