@@ -87,12 +87,10 @@ class Bridge:
         from .drivers import DongleSet  # needs cflib
 
         self.radios = DongleSet(((r.name, r.address) for r in settings.robots), log)
-        self.radios.keep_spare()
         self.monitor = SafetyMonitor(station.safety)
-        self._heartbeat: float | None = None
+        self.heartbeat: float | None = None  # s, monotonic: the ground station's last; its silence stops the swarm
         self._closing = threading.Event()
         self._guard = threading.Thread(target=self._run_rules, name="safety", daemon=True)
-        self.slowest_tick = 0.0  # s, longest time between two applications of the rules
         self._guard.start()
 
     # -- connection -------------------------------------------------------------------------------------------------
@@ -124,11 +122,6 @@ class Bridge:
         with ThreadPoolExecutor(max(1, len(vehicles))) as pool:
             problems = pool.map(lambda vehicle: vehicle.link.start_agent(), vehicles)
             return "; ".join(f"{v.name}: {text}" for v, text in zip(vehicles, problems, strict=True) if text)
-
-    @property
-    def connected(self) -> int:
-        """Number of connected Crazyflies."""
-        return sum(v.state not in OFF for v in self.vehicles.values())
 
     def reconnect(self, name: str) -> str:
         """Connect one again that is lost, disconnected or stopped; why not, or an empty text. Does not wait."""
@@ -183,21 +176,12 @@ class Bridge:
         for vehicle in self.vehicles.values():
             vehicle.stop(reason)
 
-    def note_heartbeat(self) -> None:
-        """The ground station is alive. From the first one on its silence stops the swarm."""
-        self._heartbeat = time.monotonic()
-
-    def end_heartbeat(self) -> None:
-        """The ground station ends its watch in good order."""
-        self._heartbeat = None
-
     # -- safety -----------------------------------------------------------------------------------------------------
     def _run_rules(self) -> None:
-        last = keep_alive = time.monotonic()
+        keep_alive = 0.0
         while not self._closing.wait(TICK_S):
             now = time.monotonic()
-            self.slowest_tick = max(self.slowest_tick, now - last)
-            last, feed = now, now >= keep_alive
+            feed = now >= keep_alive
             keep_alive = now + 1.0 / WATCHDOG_HZ if feed else keep_alive
             try:
                 self._apply_rules(now, feed)
@@ -206,13 +190,11 @@ class Bridge:
 
     def _apply_rules(self, now: float, feed: bool) -> None:
         vehicles = self.vehicles.values()
-        age = None if self._heartbeat is None else now - self._heartbeat
-        for vehicle in vehicles if feed else ():
-            vehicle.feed_watchdog(now, self.settings.station.safety.emergency_watchdog)
+        age = None if self.heartbeat is None else now - self.heartbeat
         for required in self.monitor.check(now, [v.watched_state(now) for v in vehicles], age):
             self._carry_out(required, now)
         for vehicle in vehicles:
-            vehicle.tick(now)
+            vehicle.tick(now, feed)
 
     def _carry_out(self, required: RequiredAction, now: float) -> None:
         action, reason = required.action, required.reason

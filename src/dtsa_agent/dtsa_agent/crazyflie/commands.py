@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .safety import SafetySettings, outside_fence
-from .state import Quaternion, Vector, to_world
+from .state import Vector, to_world
 
 VELOCITY_WORLD, POSITION, FULL_STATE = "velocity_world", "position", "full_state"
 FULL_STATE_LIMIT = 32.767  # m, m/s, m/s^2, rad/s: 16 bit numbers in thousandths
@@ -39,55 +39,41 @@ class Setpoint:
 
 def velocity_world(velocity: Vector, yaw_rate: float, stamp: float) -> Setpoint:
     """Return a velocity, m/s along the world's axes, with a yaw rate in degrees/s."""
-    return Setpoint(VELOCITY_WORLD, (*_finite(velocity), *_finite((yaw_rate,))), stamp, speed=math.hypot(*velocity))
-
-
-def position(place: Vector, yaw: float, stamp: float) -> Setpoint:
-    """Return a place, m (world), with a yaw in degrees."""
-    return Setpoint(POSITION, (*_finite(place), *_finite((yaw,))), stamp, place)
-
-
-def full_state(
-    place: Vector, velocity: Vector, acceleration: Vector, orientation: Quaternion, rates: Vector, stamp: float
-) -> Setpoint:
-    """Position m, velocity m/s, acceleration m/s^2 (world), attitude (x, y, z, w), body rates rad/s (REP-103).
-
-    Numbers beyond what the packet's 16 bits can say are kept at their limit: an overflow would send the Crazyflie the
-    other way. An orientation of length zero (an unset message) means level, heading along x.
-    """
-    vectors = [tuple(_saturate(v) for v in _finite(vector)) for vector in (place, velocity, acceleration)]
-    roll_rate, pitch_rate, yaw_rate = (_saturate(v) for v in _finite(rates))
-    q = _finite(orientation)
-    norm = math.sqrt(sum(c * c for c in q))
-    q = tuple(c / norm for c in q) if norm > 1e-6 else (0.0, 0.0, 0.0, 1.0)
-    arguments = (*vectors, q, roll_rate, pitch_rate, yaw_rate)
-    return Setpoint(FULL_STATE, arguments, stamp, place, math.hypot(*velocity))
-
-
-def _saturate(value: float) -> float:
-    return min(FULL_STATE_LIMIT, max(-FULL_STATE_LIMIT, value))
-
-
-def _finite(values: tuple[float, ...]) -> tuple[float, ...]:
-    if not all(math.isfinite(v) for v in values):
-        raise ValueError("a command with a number that is not finite")
-    return values
+    return Setpoint(VELOCITY_WORLD, (*velocity, yaw_rate), stamp, speed=math.hypot(*velocity))
 
 
 def of_message(kind: str, m: Any, origin: Vector, stamp: float) -> Setpoint:
-    """Return the set-point of a message.
+    """Return the set-point of a message of a kind.
+
+    Numbers of a full state beyond what the packet's 16 bits can say are kept at their limit: an overflow would send the
+    Crazyflie the other way. An orientation of length zero (an unset message) means level, heading along x.
 
     :param origin: m, where the world sees the origin of `map`.
     :raises ValueError: a number is not finite.
     """
     if kind == VELOCITY_WORLD:
-        return velocity_world((m.vel.x, m.vel.y, m.vel.z), m.yaw_rate, stamp)
-    shift = origin if m.header.frame_id == "map" else (0.0, 0.0, 0.0)
+        numbers = [m.vel.x, m.vel.y, m.vel.z, m.yaw_rate]
+    elif kind == POSITION:
+        numbers = [m.x, m.y, m.z, m.yaw]
+    else:
+        vectors = m.pose.position, m.twist.linear, m.acc, m.twist.angular
+        q = m.pose.orientation
+        numbers = [*(c for v in vectors for c in (v.x, v.y, v.z)), q.x, q.y, q.z, q.w]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("a command with a number that is not finite")
+    if kind == VELOCITY_WORLD:
+        return velocity_world((numbers[0], numbers[1], numbers[2]), numbers[3], stamp)
+    place = numbers[0], numbers[1], numbers[2]
+    if m.header.frame_id == "map":
+        place = to_world(place, origin)
     if kind == POSITION:
-        return position(to_world((m.x, m.y, m.z), shift), m.yaw, stamp)
-    p, q, v, w, a = m.pose.position, m.pose.orientation, m.twist.linear, m.twist.angular, m.acc
-    place = to_world((p.x, p.y, p.z), shift)
-    return full_state(place, (v.x, v.y, v.z), (a.x, a.y, a.z), (q.x, q.y, q.z, q.w), (w.x, w.y, w.z), stamp)
+        return Setpoint(kind, (*place, numbers[3]), stamp, place)
+    fixed = [min(FULL_STATE_LIMIT, max(-FULL_STATE_LIMIT, number)) for number in (*place, *numbers[3:12])]
+    norm = math.hypot(*numbers[12:])
+    orientation = tuple(c / norm for c in numbers[12:]) if norm > 1e-6 else (0.0, 0.0, 0.0, 1.0)
+    position, velocity, acceleration = (tuple(fixed[k : k + 3]) for k in (0, 3, 6))
+    arguments = (position, velocity, acceleration, orientation, *fixed[9:])
+    return Setpoint(kind, arguments, stamp, place, math.hypot(*numbers[3:6]))
 
 
 def check_setpoint(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> None:

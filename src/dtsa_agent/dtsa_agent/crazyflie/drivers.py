@@ -258,11 +258,10 @@ class DongleThread(threading.Thread):
         self.foreign = False  # another radio sends on the channel, as it seems
         self._condition = threading.Condition()
         self._links: list[RadioDriver] = []
-        self._stops: deque[tuple[int, int]] = deque()  # channel and data rate of packets that stop all
+        self._stops: deque[tuple[float, int, int]] = deque()  # when (s, monotonic), channel, rate of a stop of all
         self._closing = False
-        self._late = 0
+        self._late, self._serial = 0, ""
         self._repeated: deque[bool] = deque()
-        self._serial = ""
         self._device: Any = self._open()
         self.start()
 
@@ -300,8 +299,9 @@ class DongleThread(threading.Thread):
             self._condition.notify()
 
     def stop_channel(self, channel: int, rate: int) -> None:
-        """Stop all Crazyflies on a channel; does not wait."""
-        self._stops.append((channel, rate))
+        """Stop all Crazyflies on a channel, again and again; does not wait."""
+        now = time.monotonic()
+        self._stops.extend((now + k * PAUSE_S, channel, rate) for k in range(ROUNDS))
         self.wake()
 
     def close(self) -> None:
@@ -315,19 +315,23 @@ class DongleThread(threading.Thread):
         turn = 0
         while not self._closing or self._stops:
             if self._device is None and not self._find():
+                if self._closing:
+                    return
                 time.sleep(REOPEN_S)
                 continue
             with self._condition:
                 now, links = time.monotonic(), self._links[turn:] + self._links[:turn]
                 due = [link.due(now) for link in links]
                 ready = next((link for link, when in zip(links, due, strict=True) if when <= now), None)
-                if ready is None and not self._stops and not self._closing:
+                stop = self._stops.popleft() if self._stops and self._stops[0][0] <= now else None
+                if ready is None and stop is None and (self._stops or not self._closing):
+                    due += [when for when, _, _ in self._stops]
                     self._condition.wait(max(0.0, min(due) - now) if due else None)
                     continue
                 turn = (self._links.index(ready) + 1) % len(self._links) if ready is not None else 0
             try:
-                if self._stops:
-                    self._send_stops(*self._stops.popleft())
+                if stop is not None:
+                    self._send_stop(*stop[1:])
                 if ready is not None:
                     self._serve(ready)
             except Exception as error:  # USB's errors have no common base
@@ -349,7 +353,7 @@ class DongleThread(threading.Thread):
                 text = f"{share:.0%} of the packets on channel {link.address.channel} are repeated"
                 self._report("warn", f"radio {self.radio}: {text}: does another transmitter use its channel?")
 
-    def _send_stops(self, channel: int, rate: int) -> None:
+    def _send_stop(self, channel: int, rate: int) -> None:
         self._device.set_channel(channel)
         self._device.set_data_rate(rate)
         self._device.set_address(BROADCAST)
@@ -361,19 +365,17 @@ class DongleThread(threading.Thread):
     def _lose(self, why: str) -> None:
         links = {link.address.link for link in self._links}
         served = ", ".join(name for link, name in self._names.items() if link in links)  # in the file's order
-        self._report(
-            "error", f"radio {self.radio} ({self._serial}) is gone ({why}): {served or 'no vehicle'} out of reach"
-        )
+        gone = f"radio {self.radio} ({self._serial}) is gone ({why})"
+        self._report("error", f"{gone}: {served or 'no vehicle'} out of reach")
         device, self._device = self._device, None
         with contextlib.suppress(Exception):
             device.close()
 
     def _find(self) -> bool:
         with contextlib.suppress(Exception):  # not there yet
-            self._device = self._open()
-            self._late = 0
+            self._device, self._late = self._open(), 0
             self._report("info", f"radio {self.radio} ({self._serial}) is there again")
-        return self._device is not None or self._closing
+        return self._device is not None
 
 
 class UdpDriver(CRTPDriver):  # type: ignore[misc]
@@ -426,6 +428,8 @@ class UdpDriver(CRTPDriver):  # type: ignore[misc]
 class DongleSet:
     """The dongles of one bridge; cflib opens links by the drivers above until it is closed.
 
+    The first dongle that no link uses is kept for emergency stops.
+
     :param robots: names and addresses.
     :param report: called with a level and a line about dongles that come and go.
     """
@@ -438,8 +442,8 @@ class DongleSet:
         self._dongles: dict[str, DongleThread] = {}
         self._lock = threading.Lock()
         self._drivers: list[Any] = [partial(RadioDriver, self), UdpDriver]
-        self.spare: DongleThread | None = None  # that no link uses: emergency stops go by it
         cflib.crtp.CLASSES[:0] = self._drivers
+        self.spare = self._open_spare() if self._addresses else None
 
     def dongle(self, address: Address) -> DongleThread:
         """Return the dongle of an address; raises an error if it is not there."""
@@ -458,22 +462,20 @@ class DongleSet:
         free = [str(n) for n in range(len(get_serials())) if str(n) not in named.values()] or ["0"]
         return named.get(address.channel) or free[channels.index(address.channel) % len(free)]
 
-    def keep_spare(self) -> None:
-        """Keep the first dongle that no link uses for emergency stops."""
-        if not self._addresses:
-            return
+    def _open_spare(self) -> DongleThread | None:
         used = {self._radio(address) for address in self._addresses}
         for number, serial in enumerate(get_serials()):
             if used & {str(number), serial}:
                 continue
             try:
-                self.spare = DongleThread(str(number), self._report, self._names)
+                spare = DongleThread(str(number), self._report, self._names)
             except Exception as error:  # in use by another program, or no right to use it
                 self._report("warn", f"radio {number} cannot be used for emergency stops: {error}")
-                continue
-            self._report("info", f"radio {number} is kept for emergency stops")
-            return
+            else:
+                self._report("info", f"radio {number} is kept for emergency stops")
+                return spare
         self._report("warn", "no radio is left for emergency stops: they go by the radios of the links")
+        return None
 
     @property
     def foreign(self) -> list[str]:
@@ -482,19 +484,10 @@ class DongleSet:
 
     def stop_all(self) -> None:
         """Stop all Crazyflies on the swarm's channels, by broadcast, again and again; does not wait."""
-        jobs = []
         for address in {(a.radio, a.channel, a.rate): a for a in self._addresses}.values():
             with contextlib.suppress(Exception):  # a dongle that is not there must not keep the others from it
                 dongle = self.spare or self.dongle(address)
-                jobs.append(partial(dongle.stop_channel, address.channel, tuple(BITRATES).index(address.rate)))
-
-        def send() -> None:
-            for _ in range(ROUNDS if jobs else 0):
-                for job in jobs:
-                    job()
-                time.sleep(PAUSE_S)
-
-        threading.Thread(target=send, name="emergency-stop", daemon=True).start()
+                dongle.stop_channel(address.channel, tuple(BITRATES).index(address.rate))
 
     def close(self) -> None:
         """Close all dongles, and leave cflib as it was."""

@@ -104,11 +104,6 @@ def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
     return (v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx)
 
 
-def rotate(q: Quaternion, v: Vector) -> Vector:
-    """Rotate a vector from the axes of a body with this orientation to world axes."""
-    return rotate_inverse((-q[0], -q[1], -q[2], q[3]), v)
-
-
 # -- states ---------------------------------------------------------------------------------------------------------
 CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
 IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
@@ -145,7 +140,7 @@ class StateMachine:
         self.reason = "not connected yet"
         self._on_change = on_change
         self.arms_itself = False  # reported by the firmware
-        self._arming_ordered = False  # decides whether a Crazyflie that arms itself counts as armed
+        self.arming_ordered = False  # whether one that arms itself counts as armed
         self._landing = False  # a landing was ordered and is not over
         self._stopped = False  # an emergency stop was sent
 
@@ -155,12 +150,8 @@ class StateMachine:
             return
         before, self.state, self.reason = self.state, state, reason
         if state in OFF:
-            self._landing = self._stopped = self._arming_ordered = False
+            self._landing = self._stopped = self.arming_ordered = False
         self._on_change(before, state, reason)
-
-    def note_arming(self, armed: bool) -> None:
-        """Note that arming or disarming was ordered."""
-        self._arming_ordered = armed
 
     def note_takeoff(self, reason: str) -> None:
         """Note that a take-off was ordered: an earlier landing is over."""
@@ -206,9 +197,9 @@ class StateMachine:
         if self.state == State.LANDING or (self.state == State.LOST and self._landing):
             reason = "landed"
         if self.state in IN_AIR or self._landing:
-            self._arming_ordered = False
+            self.arming_ordered = False
         self._landing = False
-        if self._arming_ordered if self.arms_itself else info & IS_ARMED:
+        if self.arming_ordered if self.arms_itself else info & IS_ARMED:
             self.enter(State.ARMED, reason or "armed")
         else:
             self.enter(State.READY, reason or "motors locked")

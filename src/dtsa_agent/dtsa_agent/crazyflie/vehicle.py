@@ -109,8 +109,8 @@ class CrazyflieVehicle:
         self._command_time = -math.inf  # s, of the last streamed command
         self._guard_until = 0.0  # s: a take-off or go-to is flown to its end before streamed commands count again
         self._order: RepeatedOrder | None = None  # the last one, if it is to be repeated
-        self._brake: tuple[float, Callable[[], None]] | None = None  # until when to brake (s), and what comes then
-        self._blind: tuple[Vector, float] | None = None  # velocity that needs no place, and until when (s)
+        # A velocity that is streamed in place of commands, until when (s) or what, and what comes then.
+        self._steady: tuple[Vector, float, Callable[[], bool], Callable[[], None]] | None = None
         self._landings: list[float] = []  # s: when to repeat a landing that may not have been heard
 
     @property
@@ -162,9 +162,7 @@ class CrazyflieVehicle:
             return
         drifts = math.hypot(*state.velocity[:2]) > SLOW_MPS
         if state.position[2] < LOW_M and not state.info & HL_ACTIVE:
-            # Down, or about to be: with nothing to fly the end of the stream stops the motors.
-            self._order = None
-            self.link.order(end_of_stream)
+            self._end_stream()  # down, or about to be
         elif drifts or not self._landing_answered:
             self._log_info("heard again: brakes and lands")
             self._streaming = True
@@ -246,7 +244,7 @@ class CrazyflieVehicle:
         with self.lock:
             self.machine.enter(State.CONNECTING, f"connecting to {self.robot.uri}")
             self.guarded = self._overruled = self._paused = self._streaming = self._held = False
-            self._command_time, self._blind, self._order = -math.inf, None, None
+            self._command_time, self._steady, self._order = -math.inf, None, None
             self._landings.clear()
 
         def run() -> None:
@@ -277,7 +275,7 @@ class CrazyflieVehicle:
                 self._log_info("commands again")
             self._command_time = setpoint.stamp
             self._moved = self._streaming = True
-            self._held, self._brake, self._order = False, None, None
+            self._held, self._steady, self._order = False, None, None
             self.link.stream(setpoint)
             return True
 
@@ -289,7 +287,7 @@ class CrazyflieVehicle:
             if arm and (problem := self._why_misplaced()):
                 return problem
             self.action = "arming" if arm else "disarming"
-            self.machine.note_arming(arm)
+            self.machine.arming_ordered = arm
             self._moved = False
             if not self.machine.arms_itself:  # disarmed, it would arm itself again at once
                 self.link.order(lambda cf: cf.supervisor.send_arming_request(arm))
@@ -317,7 +315,7 @@ class CrazyflieVehicle:
                 return f"{self.name}: {problem}"
             if on_ground and (problem := self._why_misplaced() or (self.arm(True) if arms else "")):
                 return problem
-            self._overruled, self._moved, self._blind = False, True, None
+            self._overruled, self._moved = False, True
             if self.station.on_board.enabled:  # the last landing overruled the app: it has to be enabled anew
                 self.link.set_parameter(ENABLE, 0)
             self.machine.note_takeoff(f"take-off to {height:.2f} m")
@@ -381,8 +379,8 @@ class CrazyflieVehicle:
                 return
             self.action = f"hold: {reason}"
             if self._watch.wrong:
-                self._overruled = True
-                self._fly_blindly(STANDSTILL, math.inf)
+                self._overruled, self._held = True, False
+                self._fly_steadily(STANDSTILL, math.inf, lambda: False, lambda: None)
                 return
 
             def stay() -> None:
@@ -395,12 +393,10 @@ class CrazyflieVehicle:
             self._paused, self._held = until_seen, stale
             self._brake_then(stay)
 
-    def land(
-        self, reason: str, height: float = 0.0, duration: float = 0.0, note: Callable[[str], None] | None = None
-    ) -> str:
+    def land(self, reason: str, height: float = 0.0, duration: float = 0.0) -> str:
         """Sink to a height (m above the floor) within a duration (s; 0: at the station's speed) and stop the motors.
 
-        A landing is never refused for its numbers: one that would be too fast takes longer, and `note` is told.
+        A landing is never refused for its numbers: one that would be too fast takes longer, and the log says so.
         """
         with self.lock:
             height = height if math.isfinite(height) else 0.0
@@ -409,25 +405,21 @@ class CrazyflieVehicle:
             if self.state == State.ARMED and not self._moved:
                 return self.arm(False)  # a landing would start the motors
             self._overruled = True
-            sinks_blindly = self._blind is not None and self._blind[0] != STANDSTILL
+            sinks_blindly = self._steady is not None and self._steady[0] != STANDSTILL
             if self.state == State.LANDING and (not self._watch.wrong or sinks_blindly):
                 return ""
             self.action = f"land: {reason}"
             self._streaming |= self.state == State.LOST  # it must end a stream that the firmware may still follow
             self.machine.note_landing(self.action)
             if self._watch.wrong:
-                now = time.monotonic()
-                seen = self._measured_place(now)
-                sink_from = self._trusted_height if seen is None else seen[2]
-                self._fly_blindly((0.0, 0.0, -SINK_MPS), now + sink_from / SINK_MPS + SINK_MORE_S)
+                seen, self._held = self._measured_place(time.monotonic()), False
+                height_s = (self._trusted_height if seen is None else seen[2]) / SINK_MPS
+                self._fly_steadily((0.0, 0.0, -SINK_MPS), height_s + SINK_MORE_S, self._is_down, self._end_stream)
                 return ""
             way = self._height - height
             if 0.0 < duration < (seconds := landing_s(way, duration, self.station)):
                 why = too_short(duration, way, self.station.max_speed_mps)
-                longer = f"{self.name}: landing takes {seconds:.2f} s: {why}"
-                self._log("warn", longer)
-                if note is not None:
-                    note(longer)
+                self._log("warn", f"{self.name}: landing takes {seconds:.2f} s: {why}")
             self._brake_then(lambda: self._descend(height, duration))
             return ""
 
@@ -438,7 +430,7 @@ class CrazyflieVehicle:
                 return
             self.action = f"emergency stop: {reason}"
             self._overruled = True
-            self._brake = self._blind = self._order = None
+            self._steady = self._order = None
             for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
                 self.link.order(lambda cf: cf.supervisor.send_emergency_stop())
             self.machine.note_emergency_stop(self.action)
@@ -461,6 +453,10 @@ class CrazyflieVehicle:
         return self.last.position[2] if self.last is not None else 1.0
 
     @property
+    def _speed(self) -> float:
+        return math.hypot(*self.last.velocity) if self.last is not None else 0.0
+
+    @property
     def _landing_answered(self) -> bool:
         return self._order is not None and self._order.kind == LAND and self._order.answered
 
@@ -472,7 +468,7 @@ class CrazyflieVehicle:
         """
         now, streaming = time.monotonic(), self._streaming
         self._streaming = self._held = False
-        self._guard_until, self._brake = now + duration, None
+        self._guard_until, self._steady = now + duration, None
         end = end_of_stream if streaming else None
 
         def run(cf: Any) -> None:
@@ -492,42 +488,41 @@ class CrazyflieVehicle:
 
     def _brake_then(self, action: Callable[[], None]) -> None:
         """Slow down, then do something."""
-        now = time.monotonic()
         if self.last is None or self.state not in IN_AIR:
             action()
         else:
-            self._order, self._brake = None, (now + BRAKE_LIMIT_S, action)
-            self._slow_down(now)
+            self._fly_steadily(STANDSTILL, BRAKE_LIMIT_S, lambda: self._speed < SLOW_MPS, action)
 
-    def _slow_down(self, now: float) -> None:
-        """Go on braking, if it brakes."""
-        if self._brake is None or self.last is None:
+    def _fly_steadily(
+        self, velocity: Vector, limit_s: float, is_over: Callable[[], bool], action: Callable[[], None]
+    ) -> None:
+        """Stream a velocity (m/s), which needs no place, for so long at most or until it is over; then do something."""
+        now = time.monotonic()
+        self._order, self._steady = None, (velocity, now + limit_s, is_over, action)
+        self._go_on(now)
+
+    def _go_on(self, now: float) -> None:
+        """Send the next packet of such a stream, if there is one."""
+        if self._steady is None:
             return
-        end, action = self._brake
-        if math.hypot(*self.last.velocity) < SLOW_MPS or now > end:
-            self._brake = None
+        velocity, until, is_over, action = self._steady
+        if self.state not in IN_AIR:
+            self._steady = None
+        elif now > until or is_over():
+            self._steady = None
             action()
         else:
             self._streaming = True
-            self.link.stream(velocity_world(STANDSTILL, 0.0, now))
-
-    def _fly_blindly(self, velocity: Vector, until: float) -> None:
-        """Stream a velocity (m/s) that needs no place; once it is over (s) the motors stop."""
-        self._blind, self._brake, self._order = (velocity, until), None, None
-        self._held, self._streaming = False, True
-        self.link.stream(velocity_world(velocity, 0.0, time.monotonic()))
-
-    def _go_on_blindly(self, now: float) -> None:
-        """Send the next packet of such a stream; the motors stop once the vehicle must be down."""
-        assert self._blind is not None
-        (velocity, until), seen = self._blind, self._measured_place(now)
-        if self.state not in IN_AIR:
-            self._blind = None
-        elif now > until or (velocity != STANDSTILL and seen is not None and seen[2] < DOWN_M):
-            self._blind, self._streaming = None, False
-            self.link.order(end_of_stream)  # with nothing to fly the end of the stream stops the motors
-        else:
             self.link.stream(velocity_world(velocity, 0.0, now))
+
+    def _is_down(self) -> bool:
+        seen = self._measured_place(time.monotonic())
+        return seen is not None and seen[2] < DOWN_M
+
+    def _end_stream(self) -> None:
+        """End the stream: with nothing to fly the motors stop."""
+        self._streaming, self._order = False, None
+        self.link.order(end_of_stream)
 
     # -- called regularly -------------------------------------------------------------------------------------------
     def declare_lost(self, reason: str, now: float) -> None:
@@ -541,29 +536,29 @@ class CrazyflieVehicle:
                 self.land(reason)
                 self._landings = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
 
-    def tick(self, now: float) -> None:
-        """Called 50 times a second: goes on braking, and sends again what has not been answered."""
+    def tick(self, now: float, feed: bool) -> None:
+        """Called 50 times a second: goes on with a stream of its own, and sends again what has not been answered.
+
+        :param feed: send the emergency stop watchdog, and blind landings that are due.
+        """
         with self.lock:
             if self._paused and self.tracker is not None:
                 self._paused = self.tracker.age(now) > self.station.safety.position_age_s
-            if self._blind is not None:
-                self._go_on_blindly(now)
-            else:
-                self._slow_down(now)
+            self._go_on(now)
             if self.state not in OFF:
                 self.link.order_log(now)
             if self.state in WATCHED_OVER and self._order is not None and (order := self._order.due(now)) is not None:
                 self.link.order(order)
+            if feed:
+                self._feed_watchdog(now)
 
-    def feed_watchdog(self, now: float, watchdog: bool) -> None:
-        """What has to be sent regularly: the emergency stop watchdog, and blind landings."""
-        with self.lock:
-            if self._landings and now >= self._landings[0]:
-                self._landings.pop(0)
-                self._streaming = True  # it must end a stream that the firmware may still follow
-                self._descend(0.0, BLIND_LAND_S)
-            # From the first arming on: once it has begun, the firmware locks itself when it ends.
-            self.guarded |= watchdog and self.state in WATCHED_OVER
-            self.link.guarded = self.guarded
-            if self.guarded and self.state not in (*OFF, State.EMERGENCY):
-                self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
+    def _feed_watchdog(self, now: float) -> None:
+        if self._landings and now >= self._landings[0]:
+            self._landings.pop(0)
+            self._streaming = True  # it must end a stream that the firmware may still follow
+            self._descend(0.0, BLIND_LAND_S)
+        # From the first arming on: once it has begun, the firmware locks itself when it ends.
+        self.guarded |= self.station.safety.emergency_watchdog and self.state in WATCHED_OVER
+        self.link.guarded = self.guarded
+        if self.guarded and self.state not in (*OFF, State.EMERGENCY):
+            self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())

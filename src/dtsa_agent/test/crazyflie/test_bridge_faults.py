@@ -135,7 +135,7 @@ def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> 
         assert pilot.state(3) is State.FLYING
         pilot.logged("cf1: distance: 0.3. m from cf2")
         assert not fleet.events(name="collision")
-        pilot.bridge.note_heartbeat()
+        pilot.bridge.heartbeat = time.monotonic()
         silent = time.monotonic()
         time.sleep(0.7)
         assert pilot.state(3) is State.FLYING
@@ -175,7 +175,6 @@ def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path) -> N
         fleet.fault("refuse_arming", 3)
         with flight(data) as pilot:
             assert sorted(pilot.bridge.connect()) == ["cf1", "cf2"]
-            assert pilot.bridge.connected == 2
             pilot.bridge.order_each(["cf3", "cf4"], lambda v: v.arm(True))
             wait_for(lambda: pilot.state(4) is State.ARMED)
             pilot.bridge.land_all("armed, but still on the ground: there is nothing to land")

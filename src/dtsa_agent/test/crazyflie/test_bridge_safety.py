@@ -45,7 +45,7 @@ def test_one_that_arms_itself_is_ready_until_it_is_told_and_again_once_it_has_la
     m = machine(sm.AUTO_ARM | sm.IS_ARMED)
     on_ground, in_air = sm.AUTO_ARM | sm.IS_ARMED, sm.AUTO_ARM | sm.IS_ARMED | sm.IS_FLYING
     assert m.state is State.READY
-    m.note_arming(True)
+    m.arming_ordered = True
     m.update(sm.AUTO_ARM)  # its pre-flight check begins anew every 30 s: it is not armed for a moment
     assert m.state is State.ARMED
     m.update(in_air)
@@ -55,9 +55,9 @@ def test_one_that_arms_itself_is_ready_until_it_is_told_and_again_once_it_has_la
     m.update(on_ground)
     m.update(on_ground)
     assert m.state is State.READY
-    m.note_arming(True)
+    m.arming_ordered = True
     m.update(on_ground)
-    m.note_arming(False)
+    m.arming_ordered = False
     m.update(on_ground)
     assert m.state is State.READY
 
@@ -268,15 +268,14 @@ def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused() -> 
             with nullcontext() if allowed else pytest.raises(ValueError, match="m/s is refused"):
                 check_setpoint(command, *limits)
     assert outside_fence((9.0, 0.0, 1.0), SafetySettings(geofence=False), origin) == ""
-    still = (0.0, 0.0, 0.0)
     for setpoint, words in (
         (commands.velocity_world((1.5, 0.0, 0.0), 0.0, 0.0), ""),
-        (commands.position((1.0, 2.0, 1.0), 0.0, 0.0), ""),
-        (commands.full_state((1.0, 0.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), ""),
+        (commands.Setpoint(commands.POSITION, (), 0.0, (1.0, 2.0, 1.0)), ""),
+        (commands.Setpoint(commands.FULL_STATE, (), 0.0, (1.0, 0.0, 1.0)), ""),
         (commands.velocity_world((50.0, 0.0, 0.0), 0.0, 0.0), "50.00 m/s is refused (station.max_stream_mps is 3)"),
-        (commands.position((1.95, 0.0, 1.0), 0.0, 0.0), "0.45 m outside the geofence in x"),
-        (commands.full_state((0.0, 3.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "geofence in y"),
-        (commands.full_state((0.0, 0.0, 1.0), (0.0, 9.0, 0.0), still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "9.00 m/s"),
+        (commands.Setpoint(commands.POSITION, (), 0.0, (1.95, 0.0, 1.0)), "0.45 m outside the geofence in x"),
+        (commands.Setpoint(commands.FULL_STATE, (), 0.0, (0.0, 3.0, 1.0)), "geofence in y"),
+        (commands.Setpoint(commands.FULL_STATE, (), 0.0, (0.0, 0.0, 1.0), 9.0), "9.00 m/s"),
     ):
         with pytest.raises(ValueError, match=re.escape(words)) if words else nullcontext():
             check_setpoint(setpoint, *limits)

@@ -200,7 +200,7 @@ def check_node(node: BridgeNode, print_line: Callable[[str], None]) -> int:
 
 def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
     bridge = node.bridge
-    bridge.end_heartbeat()  # from here on the bridge alone brings them down
+    bridge.heartbeat = None  # from here on the bridge alone brings them down
     flying = first = bridge.names_in_air(time.monotonic())
     if flying:
         node.log("warn", f"landing {', '.join(flying)}; Ctrl-C again stops all motors")

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.positions import quantile
 from dtsa_agent.crazyflie.safety import outside_fence
+from dtsa_agent.crazyflie.settings import GroundStationSettings
 from dtsa_agent.crazyflie.state import OFF, State, VehicleState, place_text
 from dtsa_agent.crazyflie.vehicle import CrazyflieVehicle
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 MAX_START_OFFSET_M = 0.25  # a vehicle farther from its initial_position is reported
 MIN_LINK_QUALITY = 0.8  # share of the log packets that arrive
-MIN_POSE_AGE_S, MAX_POSE_AGE_S = -0.002, 0.1  # of motion capture; outside, poses are late or the clocks differ
+MIN_POSE_AGE_MS, MAX_POSE_AGE_MS = -2.0, 100.0  # of motion capture; outside, poses are late or the clocks differ
 MIN_PROTOCOL = 10  # older firmware has no arming requests
 NOBODY = FAIL, "unknown: no Crazyflie is connected"
 
@@ -29,13 +30,21 @@ def check_preflight(bridge: Bridge, priority_problem: str) -> list[tuple[str, st
     :param priority_problem: why there is no real-time priority; empty if there is.
     :returns: item, level (OK, WARN or FAIL) and text of each line.
     """
-    vehicles = list(bridge.vehicles.values())
+    vehicles, station = list(bridge.vehicles.values()), bridge.settings.station
     connected = [(v, v.last) for v in vehicles if v.state not in OFF and v.last is not None]
-    items = {
+    spare, priority = bridge.radios.spare, (OK, f"real-time priority {station.priority}")
+    emergency = OK, "sent by the links: there are no radios"
+    if bridge.settings.loads:
+        kept = f"radio {spare.radio} is kept for emergency stops" if spare else ""
+        emergency = (OK, kept) if kept else (WARN, "no radio is left for emergency stops: they go by the links' radios")
+    if priority_problem or not station.priority:
+        why = f"no real-time priority ({priority_problem})" if station.priority else "none (station.priority is 0)"
+        priority = WARN, f"{why}: keep the station free of other work"
+    items: dict[str, Iterable[tuple[str, str]]] = {
         "links": _links(vehicles), "firmware": _firmware(vehicles), "batteries": _batteries(connected),
-        "positions": _positions(connected), "clocks": _clocks(bridge, connected),
-        "geofence": _geofence(bridge, connected), "budget": _budget(bridge), "emergency": _emergency(bridge),
-        "priority": _priority(bridge, priority_problem),
+        "positions": _positions(connected), "clocks": _clocks(station, connected),
+        "geofence": _geofence(station, connected), "budget": _budget(bridge), "emergency": [emergency],
+        "priority": [priority],
     }  # fmt: skip
     findings = []
     for item, lines in items.items():
@@ -102,25 +111,22 @@ def _positions(connected: Connected) -> Lines:
     yield (OK, f"at most {max(offsets):.2f} m from the initial positions{capture}") if connected else NOBODY
 
 
-def _clocks(bridge: Bridge, connected: Connected) -> Lines:
-    if not bridge.settings.station.positions.enabled:
+def _clocks(station: GroundStationSettings, connected: Connected) -> Lines:
+    if not station.positions.enabled:
         yield OK, "one clock, the station's: there is no motion capture"
         return
-    ages = []
-    for v, _ in connected:
-        if v.tracker is not None and v.tracker.latencies:
-            ages.append(quantile(v.tracker.latencies, 0.5))
-            if not MIN_POSE_AGE_S <= ages[-1] <= MAX_POSE_AGE_S:
-                late = f"poses are {ages[-1] * 1000:.1f} ms old when they are sent: late, or another clock's"
-                yield WARN, f"{v.name}: {late}"
+    trackers = {v.name: v.tracker for v, _ in connected if v.tracker is not None and v.tracker.latencies}
+    ages = {name: quantile(tracker.latencies, 0.5) * 1000 for name, tracker in trackers.items()}
+    for name, age in ages.items():
+        if not MIN_POSE_AGE_MS <= age <= MAX_POSE_AGE_MS:
+            yield WARN, f"{name}: poses are {age:.1f} ms old when they are sent: late, or another clock's"
     if ages:
-        yield OK, f"poses are {min(ages) * 1000:.1f} to {max(ages) * 1000:.1f} ms old when sent"
+        yield OK, f"poses are {min(ages.values()):.1f} to {max(ages.values()):.1f} ms old when sent"
     else:
         yield WARN, "clock of motion capture unknown: no pose arrives"
 
 
-def _geofence(bridge: Bridge, connected: Connected) -> Lines:
-    station = bridge.settings.station
+def _geofence(station: GroundStationSettings, connected: Connected) -> Lines:
     fence = station.safety
     if not fence.geofence:
         yield WARN, "switched off"
@@ -139,21 +145,3 @@ def _budget(bridge: Bridge) -> Lines:
         yield WARN, f"radio {name}: packets are repeated: another transmitter uses its channel"
     if not loads:
         yield OK, "no radios (udp, usb)"
-
-
-def _emergency(bridge: Bridge) -> Lines:
-    if not bridge.settings.loads:
-        yield OK, "sent by the links: there are no radios"
-    elif bridge.radios.spare is None:
-        yield WARN, "no radio is left for emergency stops: they go by the radios of the links"
-    else:
-        yield OK, f"radio {bridge.radios.spare.radio} is kept for emergency stops"
-
-
-def _priority(bridge: Bridge, problem: str) -> Lines:
-    level = bridge.settings.station.priority
-    if level and not problem:
-        yield OK, f"real-time priority {level}"
-    else:
-        why = f"no real-time priority ({problem})" if level else "none (station.priority is 0)"
-        yield WARN, f"{why}: keep the station free of other work"

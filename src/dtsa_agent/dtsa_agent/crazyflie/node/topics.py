@@ -49,7 +49,7 @@ MAX_CLOCK_S = 0.1  # a sender's clock that is wrong makes a command at most so m
 # positioning system. Body rates are not logged.
 POSE_COVARIANCE = diagonal(0.03**2, 0.1**2)
 TWIST_COVARIANCE = diagonal(0.1**2, UNKNOWN)
-Order = Callable[[CrazyflieVehicle], str]
+Order = Callable[[CrazyflieVehicle, Any], str | None]  # of a request to a vehicle; why not, if it is refused
 
 
 def seconds(duration: DurationMsg) -> float:
@@ -64,6 +64,15 @@ def _short(value: Any) -> str:
     if isinstance(value, Point):
         return place_text((value.x, value.y, value.z))
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _go_to(vehicle: CrazyflieVehicle, request: Any) -> str:
+    goal = request.goal.x, request.goal.y, request.goal.z
+    return vehicle.go_to(goal, request.yaw, seconds(request.duration), request.relative)
+
+
+def _notify(vehicle: CrazyflieVehicle, request: Any) -> str:
+    return vehicle.notify_setpoints_stop(request.remain_valid_millisecs)
 
 
 # -- what comes in ----------------------------------------------------------------------------------------------------
@@ -93,90 +102,66 @@ class BridgeInputs:
             self._create_services(name, [name])
             self._node.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
         self._commands.start()
-        self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.note_heartbeat(), LATEST_ONLY)
+        self._node.create_subscription(EmptyMsg, "all/heartbeat", self._note_heartbeat, LATEST_ONLY)
         self._node.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
         self._create_services("all", list(self._bridge.vehicles))
 
     def _create_services(self, prefix: str, names: list[str]) -> None:
         """Create the services that take an order to one or all; `emergency` is the last."""
-        services: list[tuple[Any, str, Callable[[list[str], Any], Any]]] = [
-            *([(SetBool, "enable", self._enable)] if self._on_board else []),
-            *((kind, name, self._refuse) for kind, name in TRAJECTORIES),
-            (interfaces.Takeoff, "takeoff", self._takeoff),
-            (interfaces.Land, "land", self._land),
-            (interfaces.GoTo, "go_to", self._go_to),
-            (interfaces.Arm, "arm", self._arm),
-            (interfaces.NotifySetpointsStop, "notify_setpoints_stop", self._notify),
-            (Empty, "emergency", self._emergency),
+        enable = [(SetBool, "enable", lambda v, r: v.enable(r.data))] if self._on_board else []
+        services: list[tuple[Any, str, Order | None]] = [
+            *enable,
+            *((kind, name, None) for kind, name in TRAJECTORIES),
+            (interfaces.Takeoff, "takeoff", lambda v, r: v.takeoff(r.height, seconds(r.duration))),
+            (interfaces.Land, "land", lambda v, r: v.land("service", r.height, seconds(r.duration))),
+            (interfaces.GoTo, "go_to", _go_to),
+            (interfaces.Arm, "arm", lambda v, r: v.arm(r.arm)),
+            (interfaces.NotifySetpointsStop, "notify_setpoints_stop", _notify),
+            (Empty, "emergency", lambda v, r: v.stop("service emergency")),
         ]
-        for kind, service, callback in services:
-            name, group = f"{prefix}/{service}", self._waiting if service == "arm" else None
-            order = partial(self._ordered, name, partial(callback, names))
-            self._node.create_service(kind, name, order, callback_group=group)
+        for kind, service, order in services:
+            group = self._waiting if service == "arm" else None
+            callback = partial(self._serve, prefix, names, service, order)
+            self._node.create_service(kind, f"{prefix}/{service}", callback, callback_group=group)
 
-    def _stream(self, kind: str, vehicle: CrazyflieVehicle, message: Any, published: float) -> None:
-        """Give a message, published at a Unix time (s), to its vehicle, and say why it does not count."""
-        station = vehicle.station
-        origin = station.room_origin_in_world
-        stamp = time.monotonic() - min(max(time.time() - published, 0.0), MAX_CLOCK_S)  # as old as its publication
-        try:
-            setpoint = of_message(kind, message, origin, stamp)
-            check_setpoint(setpoint, station.safety, origin, station.max_stream_mps)
-        except ValueError as error:
-            vehicle.refused, problem = vehicle.refused + 1, str(error)
-        else:
-            reason = f"{vehicle.state.name.lower()}: {vehicle.machine.reason}"
-            problem = "" if vehicle.command(setpoint) else f"commands are not accepted now ({reason})"
-        if problem:
-            self._node.get_logger().warning(f"{vehicle.name}: {problem}", throttle_duration_sec=1.0)
-
-    async def _ordered(self, name: str, callback: Callable[[Any], Any], request: Any, response: Any) -> Any:
+    async def _serve(
+        self, prefix: str, names: list[str], service: str, order: Order | None, request: Any, response: Any
+    ) -> Any:
         """Carry out an order, and say so: what an operator did belongs to what happened."""
         try:
-            result = callback(request)
-            done, text = await result if hasattr(result, "__await__") else result
+            done, text = self._carry_out(names, service, order, request)
+            if service == "arm":
+                done, text = await self._wait_armed(names, request.arm, done, text)
         except Exception as error:  # of this order: emergency stops must still be answered
             done, text = False, f"{type(error).__name__}: {error}"
         fields = ", ".join(f"{key} {_short(getattr(request, key))}" for key in request.get_fields_and_field_types())
-        self._log("info" if done else "warn", f"order /{name} ({fields}): {'done' if done else text}")
+        self._log("info" if done else "warn", f"order /{prefix}/{service} ({fields}): {'done' if done else text}")
         if hasattr(response, "success"):
             response.success, response.message = done, text
         return response
 
-    def _members(self, names: list[str], group: int) -> list[str]:
-        """Return those that are addressed: all of them in group 0, else those in one of these groups."""
-        return [name for name in names if not group or self._masks[name] & group]
-
-    def _each(self, names: list[str], order: Order, group: int = 0) -> tuple[bool, str]:
-        if members := self._members(names, group):
-            return self._bridge.order_each(members, order)
-        return False, f"none of {', '.join(names)} is in a group of {group}"
-
-    def _refuse(self, names: list[str], request: Any) -> tuple[bool, str]:
-        return False, "trajectories are not supported: send positions, velocities or go_to"
-
-    def _takeoff(self, names: list[str], request: Any) -> tuple[bool, str]:
-        if problem := self._bridge.why_no_takeoff():
+    def _carry_out(self, names: list[str], service: str, order: Order | None, request: Any) -> tuple[bool, str]:
+        """Give an order to those that are addressed: all in group 0, else those in one of these groups."""
+        group = getattr(request, "group_mask", 0)
+        members = [name for name in names if not group or self._masks[name] & group]
+        if order is None:
+            return False, "trajectories are not supported: send positions, velocities or go_to"
+        if service == "emergency":
+            for name in names:
+                order(self._bridge.vehicles[name], request)
+            self._log("error", f"EMERGENCY STOP of {', '.join(names)}: service")
+            return True, ""
+        if not members:
+            return False, f"none of {', '.join(names)} is in a group of {group}"
+        if service == "takeoff" and (problem := self._bridge.why_no_takeoff()):
             return False, problem
-        duration = seconds(request.duration)
-        return self._each(names, lambda v: v.takeoff(request.height, duration), request.group_mask)
-
-    def _land(self, names: list[str], request: Any) -> tuple[bool, str]:
-        duration, notes = seconds(request.duration), list[str]()
-        order: Order = lambda v: v.land("service", request.height, duration, notes.append)  # noqa: E731
-        done, text = self._each(names, order, request.group_mask)
-        return done, "; ".join(filter(None, (text, *notes)))
-
-    def _go_to(self, names: list[str], request: Any) -> tuple[bool, str]:
-        if len(self._members(names, request.group_mask)) > 1 and not request.relative:
+        if service == "go_to" and len(members) > 1 and not request.relative:
             return False, "a go_to of all must be relative: they would meet in one place"
-        goal, duration = (request.goal.x, request.goal.y, request.goal.z), seconds(request.duration)
-        return self._each(names, lambda v: v.go_to(goal, request.yaw, duration, request.relative), request.group_mask)
+        return self._bridge.order_each(members, lambda vehicle: order(vehicle, request))
 
-    async def _arm(self, names: list[str], request: Any) -> tuple[bool, str]:
-        """Arm, or lock the motors, and wait until it is so; the executor serves others meanwhile."""
-        done, text = self._each(names, lambda v: v.arm(request.arm))
-        wanted, before = (State.ARMED, State.READY) if request.arm else (State.READY, State.ARMED)
+    async def _wait_armed(self, names: list[str], arm: bool, done: bool, text: str) -> tuple[bool, str]:
+        """Wait until motors may run, or are locked; the executor serves others meanwhile."""
+        wanted, before = (State.ARMED, State.READY) if arm else (State.READY, State.ARMED)
         end, future = time.monotonic() + ARMED_S, Future()
 
         def waits_for() -> list[str]:
@@ -195,27 +180,32 @@ class BridgeInputs:
             text = "; ".join(filter(None, (text, f"{', '.join(late)}: not {wanted.name.lower()}")))
         return done and not late, text
 
-    def _enable(self, names: list[str], request: Any) -> tuple[bool, str]:
-        return self._each(names, lambda v: v.enable(request.data))
-
-    def _notify(self, names: list[str], request: Any) -> tuple[bool, str]:
-        valid_ms = request.remain_valid_millisecs
-        return self._each(names, lambda v: v.notify_setpoints_stop(valid_ms), request.group_mask)
-
-    def _emergency(self, names: list[str], request: Any) -> tuple[bool, str]:
-        for name in names:
-            self._bridge.vehicles[name].stop("service emergency")
-        self._log("error", f"EMERGENCY STOP of {', '.join(names)}: service")
-        return True, ""
+    def _stream(self, kind: str, vehicle: CrazyflieVehicle, message: Any, published: float) -> None:
+        """Give a message, published at a Unix time (s), to its vehicle, and say why it does not count."""
+        station = vehicle.station
+        origin = station.room_origin_in_world
+        stamp = time.monotonic() - min(max(time.time() - published, 0.0), MAX_CLOCK_S)  # as old as its publication
+        try:
+            setpoint = of_message(kind, message, origin, stamp)
+            check_setpoint(setpoint, station.safety, origin, station.max_stream_mps)
+        except ValueError as error:
+            vehicle.refused, problem = vehicle.refused + 1, str(error)
+        else:
+            reason = f"{vehicle.state.name.lower()}: {vehicle.machine.reason}"
+            problem = "" if vehicle.command(setpoint) else f"commands are not accepted now ({reason})"
+        if problem:
+            self._node.get_logger().warning(f"{vehicle.name}: {problem}", throttle_duration_sec=1.0)
 
     def _reconnect(self, name: str, request: Any, response: Any) -> Any:
         problem = self._bridge.reconnect(name)
         response.success, response.message = not problem, problem or "connecting"
         return response
 
+    def _note_heartbeat(self, message: Any) -> None:
+        self._bridge.heartbeat = time.monotonic()
+
     def _end_heartbeat(self, request: Any, response: Any) -> Any:
-        self._bridge.end_heartbeat()
-        response.success = True
+        self._bridge.heartbeat, response.success = None, True
         return response
 
 
