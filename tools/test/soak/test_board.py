@@ -85,7 +85,7 @@ def fly(fault: str, seconds: float, seed: int, directory: Path, flags: Sequence[
         for at in np.arange(ENABLED_S + 2.0, seconds, LOOK_S).tolist():
             flight.lab.at(at, look)
         flight.lab.run(seconds)
-        return {**flight.finish(), "hover_share": modes.count(HOVER) / len(modes)}
+        return {**flight.summary(), "hover_share": modes.count(HOVER) / len(modes)}
 
 
 def _fly_with_sanitizers(fault: str, seconds: float, seed: int, directory: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.simulated import Fleet, FleetConfig, cli, crtp
-from dtsa_bench.crazyflies.simulated.fleet_config import LAYOUTS, start_positions
+from dtsa_bench.crazyflies.simulated.fleet_config import ellipse_positions
 from dtsa_bench.crazyflies.simulated.process import free_base_port
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
@@ -124,9 +124,8 @@ def test_bad_fleets_are_refused(values: dict[str, Any], field: str) -> None:
     assert error.value.field == field
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_layouts_keep_their_distance(name: str) -> None:
-    p = start_positions(name, 12)
+def test_start_positions_keep_their_distance() -> None:
+    p = ellipse_positions(12)
     assert p.shape == (3, 12)
     assert np.abs(p[0]).max() <= 1.2 + 1e-12
     assert np.abs(p[1]).max() <= 2.0 + 1e-12

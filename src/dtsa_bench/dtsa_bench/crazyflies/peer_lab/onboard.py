@@ -174,7 +174,7 @@ class OnboardSwarm:
     def __exit__(self, *unused: object) -> None:
         self.lab.close()
 
-    def finish(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """The flight is over: bags are closed; what came of it."""
         goal = np.array(self.scenario.target) + _UP
         away = np.sqrt(((goal - self.lab.motion.vehicles.position) ** 2).sum(axis=0))

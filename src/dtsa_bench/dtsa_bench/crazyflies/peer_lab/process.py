@@ -7,7 +7,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,22 +73,22 @@ def _fly(
     app: App, seconds: float, settings: LabSettings, parameters: Mapping[str, float], out: Path | None,
     swarm: SwarmConfig | None, flags: tuple[str, ...],
 ) -> dict[str, Any]:  # fmt: skip
-    finish: Callable[[], dict[str, Any]]
+    flight: Any
     if swarm is None:
-        lab = Laboratory(app, settings, out)
-        finish = lab.summary
+        flight = lab = Laboratory(app, settings, out)
     else:
         from .onboard import OnboardSwarm  # the log: others do without
 
         flight = OnboardSwarm(swarm, settings, out, key_of(swarm), flags=flags)
-        lab, finish = flight.lab, flight.finish
+        lab = flight.lab
     with lab:
+        agents = range(1, lab.settings.agents + 1)
         for name, value in parameters.items():
-            for agent in range(1, lab.settings.agents + 1):
+            for agent in agents:
                 lab.set_parameter(agent, name, value)
         lab.run(seconds)
-        logs = {str(agent): dict(lab.logs(agent)) for agent in range(1, lab.settings.agents + 1)}
-        return {**finish(), "console": lab.record.console, "warnings": lab.warnings, "logs": logs}
+        logs = {str(agent): lab.logs(agent) for agent in agents}
+        return {**flight.summary(), "console": lab.record.console, "warnings": lab.warnings, "logs": logs}
 
 
 def main() -> int:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from dtsa_agent.crazyflie.state import decompress_quaternion, yaw_of
 
-from .planner import DISABLED, Goal, Planner, Triple
+from .planner import DISABLED, FLYING, IDLE, LANDING, Goal, Planner, Triple
 from .supervisor import LEVEL_OUT, FirmwareSupervisor
 
 # What the vehicle does during a step.
@@ -25,7 +25,7 @@ FLY = "fly"  # follows a velocity command
 LEVEL = "level"  # attitude level: drifts on, only drag slows it down; height is still controlled
 
 POSITION_GAIN = 2.0  # 1/s
-PRIORITY_NONE, PRIORITY_LOWEST, PRIORITY_HIGH_LEVEL, PRIORITY_STREAM = 0, 1, 1, 2  # an app's may be higher
+PRIORITY_NONE, PRIORITY_HIGH_LEVEL, PRIORITY_STREAM = 0, 1, 2  # an app's may be higher
 
 # Of the battery, a single lithium cell.
 FULL_V = 4.15
@@ -124,7 +124,7 @@ class Firmware:
         self.groups = 0  # a bit each
         self.battery = Battery()
         self.setpoint: FirmwareSetpoint | None = None
-        self._priority = PRIORITY_NONE
+        self.priority = PRIORITY_NONE  # of the source whose setpoint counts
         self._streaming = False
         self._here = Goal()  # where a path would begin: on the present path, or where the vehicle is
         self.yaw = 0.0
@@ -134,33 +134,23 @@ class Firmware:
         """A packet of the generic commander: a streamed setpoint."""
         kind = data[0] if data else -1
         if kind == 0:
-            self._accept(FirmwareSetpoint(t, motors=False))
+            self.offer(FirmwareSetpoint(t, motors=False), PRIORITY_STREAM)
         elif kind in DECODERS and len(data) > DECODERS[kind][0]:
-            self._accept(DECODERS[kind][1](data[1:], t))
+            self.offer(DECODERS[kind][1](data[1:], t), PRIORITY_STREAM)
 
     def manual(self, data: bytes, t: float) -> None:
         """Roll, pitch, yaw rate, thrust: only thrust 0 (stop) and level flight are modelled."""
-        if len(data) < 14:
-            return
         *_, thrust = struct.unpack_from("<3fH", data)
-        self._accept(FirmwareSetpoint(t, velocity=(0.0, 0.0, 0.0), motors=thrust > 0))
-
-    @property
-    def priority(self) -> int:
-        """Priority of the source whose setpoint counts."""
-        return self._priority
-
-    def _accept(self, setpoint: FirmwareSetpoint) -> None:
-        self.offer(setpoint, PRIORITY_STREAM)
+        self.offer(FirmwareSetpoint(t, velocity=(0.0, 0.0, 0.0), motors=thrust > 0), PRIORITY_STREAM)
 
     def offer(self, setpoint: FirmwareSetpoint, priority: int) -> bool:
         """Accept a setpoint from a source of this priority; False: one of a higher priority counts."""
-        if priority < self._priority:
+        if priority < self.priority:
             return False
-        self._priority = priority
+        self.priority = priority
         self.setpoint = setpoint
         if priority > PRIORITY_HIGH_LEVEL:
-            self.planner.stop()
+            self.planner.state = IDLE
             if not self._streaming:
                 self._streaming = True
                 self._report("streaming")
@@ -168,8 +158,8 @@ class Firmware:
 
     def notify_stop(self) -> None:
         """The stream of setpoints is over: high-level commands count again."""
-        if self._priority > PRIORITY_HIGH_LEVEL:
-            self._priority = PRIORITY_LOWEST
+        if self.priority > PRIORITY_HIGH_LEVEL:
+            self.priority = PRIORITY_HIGH_LEVEL
             self._streaming = False
             self._report("stream ended")
 
@@ -184,23 +174,25 @@ class Firmware:
         if data[1] and not data[1] & self.groups:
             return 0
         if kind == 3:
-            self.planner.stop()
+            self.planner.state = IDLE
             self._report("high-level stop")
             return 0
-        here = self._here
+        here, state = self._here, self.planner.state
         if kind == 12:
             _, relative, _, x, y, z, yaw, duration = struct.unpack_from("<B??5f", data, 1)
             if relative:
                 x, y, z = (a + b for a, b in zip((x, y, z), here.position, strict=True))
                 yaw += self.yaw
-            self.planner.go_to(t, here, (x, y, z), yaw, duration)
+            self.planner.plan(FLYING, t, here, (x, y, z), yaw, duration)
             self._report("go_to", goal=[round(v, 3) for v in (x, y, z)])
             return 0
         _, height, yaw, keep_yaw, duration = struct.unpack_from("<Bff?f", data, 1)
-        name, order = ("takeoff", self.planner.takeoff) if kind == 7 else ("land", self.planner.land)
-        if not order(t, here, height, self.yaw if keep_yaw else yaw, duration):
+        takes_off = kind == 7
+        if state != IDLE if takes_off else state == LANDING:
             return 1
-        self._report(name, height=round(height, 3))
+        place, yaw = (*here.position[:2], height), self.yaw if keep_yaw else yaw
+        self.planner.plan(FLYING if takes_off else LANDING, t, Goal(here.position), place, yaw, duration)  # from rest
+        self._report("takeoff" if takes_off else "land", height=round(height, 3))
         return 0
 
     # -- one step of control ----------------------------------------------------------------------------------------
@@ -208,11 +200,14 @@ class Firmware:
         """What the vehicle does from t to t + dt by its estimate: OFF, FLY or LEVEL, and the velocity command, m/s."""
         allowed = self.supervisor.motors_allowed
         if not allowed:
-            self.planner.stop()
+            self.planner.state = IDLE
         goal = self.planner.goal(t)
         self._here = goal or Goal(position, velocity, yaw=self.yaw)
-        if allowed and self._priority <= PRIORITY_HIGH_LEVEL and self.planner.state != DISABLED:
-            self._follow_planner(t, goal)
+        if allowed and self.priority <= PRIORITY_HIGH_LEVEL and self.planner.state != DISABLED:
+            self.priority = PRIORITY_HIGH_LEVEL
+            self.setpoint = FirmwareSetpoint(t, motors=False)  # if it has nothing to fly
+            if goal is not None:
+                self.setpoint = FirmwareSetpoint(t, goal.position, goal.velocity, goal.acceleration, yaw=goal.yaw)
         setpoint = self.setpoint if allowed else None
         thrust = setpoint is not None and setpoint.motors
         age = math.inf if setpoint is None else t - setpoint.time
@@ -220,18 +215,7 @@ class Firmware:
         self.battery.update(dt, motors=thrust)
         if not (thrust and self.supervisor.motors_allowed) or setpoint is None:
             return OFF, (0.0, 0.0, 0.0)
-        command = self._velocity(setpoint, position, dt)
-        if self.supervisor.state == LEVEL_OUT:
-            return LEVEL, command
-        return FLY, command
-
-    def _follow_planner(self, t: float, goal: Goal | None) -> None:
-        """The high-level commander's setpoint: where to be, or motors off if it has nothing to fly."""
-        self._priority = PRIORITY_HIGH_LEVEL
-        if goal is None:
-            self.setpoint = FirmwareSetpoint(t, motors=False)
-        else:
-            self.setpoint = FirmwareSetpoint(t, goal.position, goal.velocity, goal.acceleration, yaw=goal.yaw)
+        return LEVEL if self.supervisor.state == LEVEL_OUT else FLY, self._velocity(setpoint, position, dt)
 
     def _velocity(self, s: FirmwareSetpoint, position: Triple, dt: float) -> Triple:
         if s.yaw is not None:

@@ -27,10 +27,6 @@ EMERGENCY_WATCHDOG_S = 1.0
 PREFLIGHT_TIMEOUT_S = 30.0  # armed, but not taken off
 LANDING_TIMEOUT_S = 3.0  # landed: disarmed after that long
 
-CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
-IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
-HL_ACTIVE, HL_FINISHED = 256, 512
-
 
 class FirmwareSupervisor:
     """State machine of one Crazyflie; `auto_arming`: a 2.1 or 2.1+, a 2.1 brushless or a Bolt waits to be armed."""
@@ -148,14 +144,8 @@ class FirmwareSupervisor:
 
     def info(self, *, planner_active: bool, trajectory_finished: bool) -> int:
         """The bit field `supervisor.info`."""
-        bits = IS_ARMED if self.armed else 0
-        bits |= CAN_BE_ARMED if self.state == CHECKED and not self.refuse_arming else 0
-        bits |= AUTO_ARM if self.auto_arming else 0
-        bits |= CAN_FLY if self.motors_allowed else 0
-        bits |= IS_FLYING if self.flying else 0
-        bits |= IS_TUMBLED if self.tumbled else 0
-        bits |= IS_LOCKED if self.state == LOCKED else 0
-        bits |= IS_CRASHED if self.crashed else 0
-        bits |= HL_ACTIVE if planner_active else 0
-        bits |= HL_FINISHED if trajectory_finished else 0
-        return bits
+        flags = (  # from the lowest bit on
+            self.state == CHECKED and not self.refuse_arming, self.armed, self.auto_arming, self.motors_allowed,
+            self.flying, self.tumbled, self.state == LOCKED, self.crashed, planner_active, trajectory_finished,
+        )  # fmt: skip
+        return sum(1 << bit for bit, flag in enumerate(flags) if flag)

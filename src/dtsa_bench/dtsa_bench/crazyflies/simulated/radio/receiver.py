@@ -46,12 +46,11 @@ class RadioReceiver:
         self.last_heard = float("-inf")
 
     def connected(self, t: float) -> bool:
-        """Whether a packet came in the last second (t: s)."""
-        return t - self.last_heard < ACTIVITY_S
-
-    def clear(self) -> None:
-        """Nobody is there: what waits is forgotten."""
+        """Whether a packet came in the last second (t: s); if not, what waits is forgotten."""
+        if t - self.last_heard < ACTIVITY_S:
+            return True
         self._queue.clear()
+        return False
 
     def push(self, packet: bytes) -> None:
         """A packet for the ground station; lost if too many wait."""
