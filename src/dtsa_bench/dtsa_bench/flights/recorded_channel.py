@@ -60,13 +60,14 @@ class RecordedFlight:
         self.measurement = FlightMeasurement(run, self.scenario)
         model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
         self.run_id = identity.number
-        limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed}
-        limits["swarm_namespace"] = space
-        self.channel: LockstepChannel | RealtimeChannel
-        if run.mode == LOCKSTEP:
-            self.channel = LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
-        else:
-            self.channel = RealtimeChannel(node, model, steps, referee=referee, **limits)
+        limits: dict[str, Any] = {
+            "startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed, "swarm_namespace": space,
+        }  # fmt: skip
+        self.channel: LockstepChannel | RealtimeChannel = (
+            LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
+            if run.mode == LOCKSTEP
+            else RealtimeChannel(node, model, steps, referee=referee, **limits)
+        )
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
             FlightRecorder(directory / BAG, run, self.scenario, self.run_id),
@@ -104,13 +105,13 @@ class RecordedFlight:
         summary = {**self.summary(), **more}
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         (self.directory / "summary.json").write_text(text, encoding="utf-8")
-        positions = self.measurement.positions
-        if positions and pictures:
+        path = self.measurement.positions.array()
+        if len(path) and pictures:
             picture = self.directory / "trajectories.png"
             with optional_picture(picture):
                 from dtsa_bench.drawing.flight_paths import draw_flight
 
-                draw_flight(picture, self.scenario, positions.array(), summary)
+                draw_flight(picture, self.scenario, path, summary)
         return summary
 
 

@@ -172,8 +172,8 @@ def table(result: dict[str, Any]) -> str:
             {True: "yes", False: "no", None: "-"}[row["hears_this_agent"]],
             ", ".join(f"cf{k}" for k in row["does_not_hear"]) or "-",
         ))  # fmt: skip
-    widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
-    lines = ["  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
     about = f"cf{result['id']}: {result['agents']} agents, slots of {result['slot_ms']:g} ms, {result['slots']} slots"
     refused = "; ".join(f"{count} {reason}" for reason, count in result["not_taken_in"].items())
     return "\n".join([about, *lines, *([f"not taken in: {refused}"] if refused else [])]) + "\n"

@@ -349,7 +349,7 @@ class Laboratory:
             self.peers[k].reset()
 
     def set_parameter(self, agent: int, name: str, value: float) -> None:
-        """Set a parameter of the app, now and after each power on; ConfigError: it has none of that name (group.name)."""
+        """Set a parameter (group.name) of the app, now and after each power on; ConfigError: it has none such."""
         k = self._index(agent)
         self._parameters[k][name] = value
         if self._on[k]:
