@@ -5,7 +5,6 @@ than 0.2 m to another, and all decisions made again are equal.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import subprocess
@@ -73,7 +72,8 @@ def fly(fault: str, seconds: float, seed: int, directory: Path, flags: Sequence[
     """One flight of virtual time with a fault; what the laboratory says of it."""
     settings = LabSettings(seed=seed, drift_ppm=50.0, **FAULTS[fault])  # type: ignore[arg-type]
     swarm = SwarmConfig(agents=AGENTS, policy="lease", seed=seed, targets_known=False)
-    with OnboardSwarm(swarm, settings, directory, enable_s=ENABLED_S, flags=flags) as flight:
+    app = read_app(APP, flags=tuple(flags))
+    with OnboardSwarm(swarm, settings, directory, enable_s=ENABLED_S, app=app) as flight:
         _change_goals(flight, seconds)
         _schedule_fault(flight, fault, seconds, seed)
         modes: list[int] = []
@@ -90,8 +90,7 @@ def fly(fault: str, seconds: float, seed: int, directory: Path, flags: Sequence[
 
 def _fly_with_sanitizers(fault: str, seconds: float, seed: int, directory: Path) -> dict[str, Any]:
     """The same in a process of its own: the sanitizers have to be there before Python is."""
-    app = read_app(APP)
-    environment = sanitizer_environment(dataclasses.replace(app, flags=(*app.flags, *SANITIZERS)))
+    environment = sanitizer_environment(read_app(APP, flags=SANITIZERS))
     words = [fault, str(seconds), str(seed), str(directory), *SANITIZERS]
     done = subprocess.run(
         [sys.executable, __file__, *words], env={**os.environ, **environment}, capture_output=True, text=True

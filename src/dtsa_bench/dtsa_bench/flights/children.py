@@ -47,10 +47,7 @@ class Child:
 
 
 class Children:
-    """The processes that one supervisor started.
-
-    :param environment: their environment variables, on top of this process's.
-    """
+    """The processes that one supervisor started, with these environment variables on top of its own."""
 
     def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
         self._logs = logs

@@ -59,12 +59,8 @@ from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import LateStart, RealtimeSupervisor, Supervisor
 
-ENVIRONMENT = {
-    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    # A node needs no more threads than its own: NumPy's would cost start-up time and memory.
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-}
+# A node needs no more threads than its own: NumPy's would cost start-up time and memory.
+ENVIRONMENT = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 # The log of this process's nodes goes to /rosout alone: the progress line tells the same here.
 QUIET = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
@@ -73,10 +69,7 @@ END_S = 1.0  # wall time in which the nodes are to hear of the end; those that h
 
 
 def run_environment(domain: int, logs: Path) -> dict[str, str]:
-    """Variables for the processes of a run; this process gets those that its own node needs.
-
-    :param logs: directory for ROS's logs.
-    """
+    """Variables for the processes of a run; this process gets those that its own node needs."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     limit_to_machine(os.environ)
@@ -237,10 +230,7 @@ def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: Fl
 def _start_agents(
     children: Children, run: RunConfig, options: FlightOptions, directory: Path, stop: Stop
 ) -> list[LateStart]:
-    """Starts the agents' processes, but for those that come late.
-
-    :raises KeyboardInterrupt: on a signal; not while a process is being started, so that none is forgotten.
-    """
+    """Start the agents' processes, but for those that come late; KeyboardInterrupt: on a signal, between two."""
     common = parameter_arguments(directory, {**to_parameters(run.swarm.to_dict(), SwarmConfig), "mode": run.mode})
     late: list[LateStart] = []
     for process in agent_processes(run, options.processes, options.priority):

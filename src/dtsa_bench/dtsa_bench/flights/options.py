@@ -14,8 +14,7 @@ from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import make_clocks
 from dtsa_channel_sim.model.config import AnswerLimits
 
-# Process priority in real time where there is no real-time priority: agents give way to the channel, which goes first
-# where it may.
+# Where there is no real-time priority: agents give way to the channel, which goes first where it may.
 AGENTS_NICE, CHANNEL_NICE = 5, -10
 
 
@@ -71,10 +70,7 @@ class AgentProcess:
 
 
 def process_count(text: str, agents: int) -> int | None:
-    """Return in how many processes agents live, from ``per-agent`` or a number; None: one an agent.
-
-    :raises ConfigError: for another text, or more processes than agents.
-    """
+    """Return in how many processes agents live, from ``per-agent`` or a number; None: one an agent."""
     if text == "per-agent":
         return None
     if not text.isdecimal() or not 1 <= int(text) <= agents:

@@ -20,33 +20,6 @@ _LATE = 0.005  # share of frames, or of entries of reports
 _ON_TIME = 0.95
 
 
-class DeliveryStatistics(ChannelObserver):
-    """How long after its arrival by the channel's time line each receiver took in a frame, as it says itself."""
-
-    def __init__(self, agents: int) -> None:
-        self._agents, self._delays = agents, Delays(agents)
-
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        for taken in answers.receipts or ():
-            receivers = np.flatnonzero(taken.mask)
-            self._delays.add_many(taken.at_ns[receivers] - taken.arrival_ns, receivers)
-
-    def summary(self) -> dict[str, Any]:
-        """The results, ms; None where nothing was heard."""
-        delays = self._delays
-        receivers: dict[str, int | None] = {"all": None, **{str(k + 1): k for k in range(self._agents)}}
-        return {
-            "delivery_ms": {
-                name: {
-                    "p50": delays.quantile_ms(0.5, series),
-                    "p99": delays.quantile_ms(0.99, series),
-                    "max": delays.largest_ms(series),
-                }
-                for name, series in receivers.items()
-            }
-        }
-
-
 def channel_summary(channel: RealtimeChannel) -> dict[str, Any]:
     """How the channel kept up."""
     pace = channel.pace
@@ -122,8 +95,8 @@ class _Sends:
         return float(np.median(self._kept))
 
 
-class ClockStatistics(ChannelObserver):
-    """Collects when slots start and frames leave, and sums it up."""
+class TimingStatistics(ChannelObserver):
+    """Collects when slots start, frames leave, and receivers have them, as they say themselves, and sums it up."""
 
     def __init__(self, agents: int) -> None:
         self._agents = agents
@@ -134,6 +107,12 @@ class ClockStatistics(ChannelObserver):
         self._spread_sum = self._spread_max = 0.0  # ns, over those
         self._last_spreads: deque[float] = deque(maxlen=_END)  # ns
         self._away: dict[int, _Sends] = {}  # by agent
+        self._delays = Delays(agents)  # by receiver, from a frame's arrival by the channel's time line
+
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+        for taken in answers.receipts or ():
+            receivers = np.flatnonzero(taken.mask)
+            self._delays.add_many(taken.at_ns[receivers] - taken.arrival_ns, receivers)
 
     def report(self, message: Fields) -> None:
         """Receive what one process says of some slots; nothing of slots that have been summed up."""
@@ -168,12 +147,19 @@ class ClockStatistics(ChannelObserver):
         ``clock_spread_*_ms``: between the first and the last agent's start of the same slot, over all slots, and the
         largest of the last 50; ``send_offset_ms``: by agent, how far its frames left from the swarm's common time (the
         median of the slot's starts; beyond 4096 frames the median is that of evenly spread ones);
-        ``sends_on_time_share``: frames within 1 ms of it.
+        ``sends_on_time_share``: frames within 1 ms of it; ``delivery_ms``: how long after its arrival by the channel's
+        time line receivers took in a frame.
         """
         for slot in sorted(self._open):
             self._sum_up(slot)
         frames = sum(sends.count for sends in self._away.values())
+        delays, receivers = self._delays, {"all": None, **{str(k + 1): k for k in range(self._agents)}}
         return {
+            "delivery_ms": {
+                name: {"p50": delays.quantile_ms(0.5, k), "p99": delays.quantile_ms(0.99, k),
+                       "max": delays.largest_ms(k)}
+                for name, k in receivers.items()
+            },
             "clock_spread_max_ms": self._spread_max / 1e6 if self._spreads else None,
             "clock_spread_mean_ms": self._spread_sum / self._spreads / 1e6 if self._spreads else None,
             "clock_spread_end_ms": max(self._last_spreads) / 1e6 if self._spreads else None,
@@ -182,4 +168,4 @@ class ClockStatistics(ChannelObserver):
                 str(agent): {"median": sends.median() / 1e6, "max": sends.largest / 1e6}
                 for agent, sends in sorted(self._away.items())
             },
-        }
+        }  # fmt: skip

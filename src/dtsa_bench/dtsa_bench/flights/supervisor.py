@@ -78,10 +78,7 @@ class RealtimeSupervisor(ChannelObserver):
             self._print(f"{agent_names([start.agent])} is started")
 
     def _report_end(self, child: Child) -> None:
-        """Takes note that a process has ended.
-
-        :raises NodeError: when no agent is left.
-        """
+        """Take note that a process has ended; NodeError: no agent is left."""
         left = not child.process.returncode
         self._print(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
         for agent in child.agents:
@@ -93,7 +90,7 @@ class RealtimeSupervisor(ChannelObserver):
             raise NodeError(f"no agent is left: {describe_end(child)}")
 
     def _restart(self, child: Child) -> None:
-        """Starts the program of some agents again; their vehicles have gone on hovering where they were."""
+        """Start the program of some agents again; their vehicles have gone on hovering where they were."""
         places = [value for agent in child.agents for value in self._channel.last_place(agent)]
         self._children.restart(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
         self._print(f"{child.name} is started again")

@@ -150,7 +150,7 @@ def test_who_hears_nobody_hovers_and_then_lands() -> None:
         lab.run(9.6)
         assert lab.from_apps[-1][2] == b"Z\0order"
         for agent in (2, 3):  # their radios only: they hang in the air by the high-level commander
-            flight.mute(agent)
+            lab.set_parameter(agent, "dtsa.mute", 1)
         lab.run(11.0)
         assert (lab.log(1, "dtsa.mode"), lab.log(1, "dtsa.why")) == (HOVER, UNHEARD)
         lab.run(18.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import tracemalloc
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,7 +17,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Frame, Process, Report, Slot
 from rclpy.node import Node
 
-from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
 from dtsa_agent.core.frame import encode_frame
@@ -29,7 +28,6 @@ from dtsa_agent.ros.common.messages import header_of
 from dtsa_bench.flights import measurement
 from dtsa_bench.flights.measurement import FlightPath
 from dtsa_bench.flights.recorded_channel import RecordedFlight
-from dtsa_bench.flights.slot_messages import SlotMessages
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.verdict import Verdict
@@ -267,28 +265,6 @@ def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_pat
     assert channel.air.late == 1
     # That of agent 1 disturbed nobody; agent 2 was heard by the one other agent.
     assert sender.frames == [(2, [True, False], 0)]
-
-
-AGENTS, RUN, SLOT_NS = 9, 77, 10_000_000
-PACKED = SlotMessages(make_scenario(SwarmConfig(agents=AGENTS)), SLOT_NS, RUN)
-
-
-def test_combinations_of_reasons_are_not_kept_for_ever() -> None:
-    packed, answers = SlotMessages(make_scenario(SwarmConfig(agents=AGENTS)), SLOT_NS, RUN), Answers(AGENTS, 1)
-
-    def pack(first: int) -> int:
-        for slot in range(first, first + 700):
-            answers.reason[:] = [(slot >> bit) & 1 for bit in range(AGENTS)][::-1]
-            answers.reason[0] = slot % 7
-            packed.decision(slot, answers)
-        return tracemalloc.get_traced_memory()[0]
-
-    tracemalloc.start()
-    try:
-        before = pack(0)
-        assert pack(700) < before + 50_000
-    finally:
-        tracemalloc.stop()
 
 
 def test_a_path_that_grows_too_long_keeps_every_second_slot(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_bench.flights.statistics import ClockStatistics
+from dtsa_bench.flights.statistics import TimingStatistics
 from dtsa_bench.log.verify.on_air import FramesOnAir
 from dtsa_bench.log.verify.result import Mismatch
 from dtsa_channel_sim import Air, Channel, ChannelConfig
@@ -94,7 +94,7 @@ def both_heard(gap_ns: int, second: int) -> FramesOnAir:
 
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:
-    statistics = ClockStatistics(3)
+    statistics = TimingStatistics(3)
 
     def report(slots: list[int], agents: list[int], offsets_ns: list[int], lengths: list[int]) -> None:
         values = {"slot": slots, "agent": agents, "offset_ns": offsets_ns, "length": lengths}
@@ -110,4 +110,4 @@ def test_spread_and_lateness_come_from_the_right_agents() -> None:
     assert summary["clock_spread_end_ms"] == pytest.approx(0.4)
     assert summary["sends_on_time_share"] == 0.5
     assert summary["send_offset_ms"]["3"] == {"median": pytest.approx(3.0), "max": pytest.approx(3.0)}
-    assert ClockStatistics(3).summary()["clock_spread_max_ms"] is None
+    assert TimingStatistics(3).summary()["clock_spread_max_ms"] is None

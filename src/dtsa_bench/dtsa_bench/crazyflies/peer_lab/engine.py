@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_bench.crazyflies.simulated.crtp import LOG_TYPES, PARAM_TYPES, READ_ONLY, VariableEntry
 from dtsa_bench.crazyflies.simulated.firmware import FirmwareSetpoint
 
@@ -102,15 +102,9 @@ class Engine:
     """
 
     def __init__(
-        self,
-        library: Path,
-        count: int,
-        names: list[str],
-        parameters: list[str],
-        line_fixed_ns: int,
-        line_byte_ns: int,
-        spin_ns: int,
-    ) -> None:
+        self, library: Path, count: int, names: list[str], parameters: list[str], line_fixed_ns: int,
+        line_byte_ns: int, spin_ns: int,
+    ) -> None:  # fmt: skip
         self._library = ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)  # apps find the firmware's functions in it
         for name, (result, arguments) in _SIGNATURES.items():
             function = getattr(self._library, name)
@@ -119,7 +113,6 @@ class Engine:
         times = line_fixed_ns, line_byte_ns, spin_ns
         if self._library.lab_begin(count, len(names), texts, len(parameters), more, *times):
             raise MemoryError
-        self._run = self._library.lab_run
         #: Values of the firmware's log variables by vehicle, in the order of their names: written by the owner.
         self.firmware_logs: list[NDArray[np.float64]] = [
             np.ctypeslib.as_array(self._library.lab_log_values(k), (len(names),)) for k in range(count)
@@ -136,7 +129,7 @@ class Engine:
 
     def run(self, until_ns: int) -> _Report:
         """Run the apps until a time, or until one asks or tells something: then `kind` is not NONE."""
-        return self._run(until_ns).contents  # type: ignore[no-any-return]
+        return self._library.lab_run(until_ns).contents  # type: ignore[no-any-return]
 
     def boot(
         self, vehicle: int, app: Path, now_ns: int, drift_ppb: int, address: int, channel: int, speed: int
@@ -168,18 +161,25 @@ class Engine:
         """A packet of the app channel has come to a vehicle; False: its queue is full."""
         return bool(self._library.lab_app_channel(vehicle, now_ns, data, len(data)))
 
-    # The app's own parameters and log variables, by name (group.name). KeyError: none of that name, or switched off.
+    # The app's own parameters and log variables, by name (group.name).
     def names(self, vehicle: int, *, parameters: bool) -> list[str]:
         """Names of the app's parameters, or of its log variables; none while it is switched off."""
         return list(self._variables.get((vehicle, parameters), ()))
 
+    def _index(self, vehicle: int, name: str, parameter: bool) -> int:
+        names = self._variables.get((vehicle, parameter), {})
+        if name not in names:
+            what = "parameter" if parameter else "log variable"
+            raise ConfigError(what, name, f"of agent {vehicle + 1}: {', '.join(names) or 'none'}")
+        return names[name]
+
     def get(self, vehicle: int, name: str, *, parameter: bool) -> float:
-        """Value of a parameter or a log variable of the app."""
-        return float(self._library.lab_get(vehicle, parameter, self._variables[vehicle, parameter][name]))
+        """Value of a parameter or a log variable of the app; ConfigError: none of that name, or switched off."""
+        return float(self._library.lab_get(vehicle, parameter, self._index(vehicle, name, parameter)))
 
     def set(self, vehicle: int, now_ns: int, name: str, value: float) -> None:
-        """Set a parameter of the app."""
-        self._library.lab_set(vehicle, now_ns, self._variables[vehicle, True][name], value)
+        """Set a parameter of the app; ConfigError: none of that name, or switched off."""
+        self._library.lab_set(vehicle, now_ns, self._index(vehicle, name, True), value)
 
     def entries(self, vehicle: int, *, parameters: bool) -> list[VariableEntry]:
         """Parameters or log variables of the app, as a ground station sees them."""

@@ -353,33 +353,23 @@ class Laboratory:
         k = self._index(agent)
         self._parameters[k][name] = value
         if self._on[k]:
-            self._check_name(k, name, parameters=True)
             self._engine.set(k, self.now_ns, name, value)
 
     def parameter(self, agent: int, name: str) -> float:
         """Value of a parameter of the app; ConfigError: it has none of that name, or is switched off."""
-        k = self._index(agent)
-        self._check_name(k, name, parameters=True)
-        return self._engine.get(k, name, parameter=True)
+        return self._engine.get(self._index(agent), name, parameter=True)
 
     def log(self, agent: int, name: str) -> float:
         """Value of a log variable, the firmware's or the app's; ConfigError: there is none, or it is switched off."""
         k = self._index(agent)
         if name in _NAMES:
             return float(self._engine.firmware_logs[k][_NAMES.index(name)])
-        self._check_name(k, name, parameters=False)
         return self._engine.get(k, name, parameter=False)
 
     def logs(self, agent: int) -> dict[str, float]:
         """All log variables of the app; none while it is switched off."""
         k = self._index(agent)
         return {name: self._engine.get(k, name, parameter=False) for name in self._engine.names(k, parameters=False)}
-
-    def _check_name(self, k: int, name: str, *, parameters: bool) -> None:
-        names = self._engine.names(k, parameters=parameters)
-        if name not in names:
-            what = "parameter" if parameters else "log variable"
-            raise ConfigError(what, name, f"of agent {k + 1}: {', '.join(names) or 'none'}")
 
     def send(self, agent: int, data: bytes) -> bool:
         """A packet of the app channel; False: the app's queue of ten is full.

@@ -1,4 +1,4 @@
-"""Command line of the simulated fleet: `dtsa fake-crazyflie`, and the executable `fake_crazyflie`."""
+"""Command line of the simulated fleet: `dtsa fake-crazyflie`."""
 
 from __future__ import annotations
 
@@ -168,23 +168,3 @@ def _show_status(fleet: Fleet) -> None:
             print(f"\r{line}          " if terminal else line, end=end, flush=True)
 
     fleet.shown = show
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Entry point of the executable."""
-    parser = argparse.ArgumentParser(
-        prog="fake_crazyflie",
-        description=DESCRIPTION,
-        allow_abbrev=False,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add_arguments(parser)
-    try:
-        return run(parser.parse_args(argv))
-    except ConfigError as error:
-        print(f"fake_crazyflie: {error}", file=sys.stderr)
-        return 2
-
-
-if __name__ == "__main__":
-    sys.exit(main())

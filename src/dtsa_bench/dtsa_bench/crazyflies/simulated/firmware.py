@@ -70,38 +70,29 @@ class FirmwareSetpoint:
     motors: bool = True
 
 
-def _decode_position(data: bytes, t: float) -> FirmwareSetpoint:
-    x, y, z, yaw = struct.unpack_from("<4f", data)
-    return FirmwareSetpoint(t, position=(x, y, z), yaw=math.radians(yaw))
+# Length of a packet on the generic commander's port, by its type: stop, full state, position, velocity, hover. 8 and 10
+# count yaw rates as usual; the older 1 and 5 have the opposite sign and are not sent to protocol version 9 and later.
+LENGTHS = {0: 1, 6: 29, 7: 17, 8: 17, 10: 17}
 
 
-def _decode_velocity(data: bytes, t: float) -> FirmwareSetpoint:
-    x, y, z, rate = struct.unpack_from("<4f", data)
-    return FirmwareSetpoint(t, velocity=(x, y, z), yaw_rate=math.radians(rate))
-
-
-def _decode_hover(data: bytes, t: float) -> FirmwareSetpoint:
-    vx, vy, rate, height = struct.unpack_from("<4f", data)
-    return FirmwareSetpoint(t, body_velocity=(vx, vy), height=height, yaw_rate=math.radians(rate))
-
-
-def _decode_full_state(data: bytes, t: float) -> FirmwareSetpoint:
-    values = struct.unpack_from("<9hI3h", data)
-    position, velocity, acceleration = (
-        (values[i] / 1000, values[i + 1] / 1000, values[i + 2] / 1000) for i in (0, 3, 6)
-    )
-    yaw = yaw_of(decompress_quaternion(values[9]))
-    return FirmwareSetpoint(t, position, velocity, acceleration, yaw=yaw, yaw_rate=values[12] / 1000)
-
-
-# Type byte of a packet on the generic commander's port -> decoder. 8 and 10 count yaw rates as usual; the
-# older 1 and 5 have the opposite sign and are not sent to protocol version 9 and later.
-DECODERS: dict[int, tuple[int, Callable[[bytes, float], FirmwareSetpoint]]] = {
-    6: (28, _decode_full_state),
-    7: (16, _decode_position),
-    8: (16, _decode_velocity),
-    10: (16, _decode_hover),
-}
+def decode_setpoint(data: bytes, t: float) -> FirmwareSetpoint:
+    """The setpoint of such a packet that came at t (s)."""
+    kind = data[0]
+    if kind == 0:
+        return FirmwareSetpoint(t, motors=False)
+    if kind == 6:
+        values = struct.unpack_from("<9hI3h", data, 1)
+        position, velocity, acceleration = (
+            (values[i] / 1000, values[i + 1] / 1000, values[i + 2] / 1000) for i in (0, 3, 6)
+        )
+        yaw = yaw_of(decompress_quaternion(values[9]))
+        return FirmwareSetpoint(t, position, velocity, acceleration, yaw=yaw, yaw_rate=values[12] / 1000)
+    a, b, c, d = struct.unpack_from("<4f", data, 1)
+    if kind == 7:
+        return FirmwareSetpoint(t, position=(a, b, c), yaw=math.radians(d))
+    if kind == 8:
+        return FirmwareSetpoint(t, velocity=(a, b, c), yaw_rate=math.radians(d))
+    return FirmwareSetpoint(t, body_velocity=(a, b), height=d, yaw_rate=math.radians(c))
 
 
 class Firmware:
@@ -132,11 +123,8 @@ class Firmware:
     # -- commands from the radio ------------------------------------------------------------------------------------
     def stream(self, data: bytes, t: float) -> None:
         """A packet of the generic commander: a streamed setpoint."""
-        kind = data[0] if data else -1
-        if kind == 0:
-            self.offer(FirmwareSetpoint(t, motors=False), PRIORITY_STREAM)
-        elif kind in DECODERS and len(data) > DECODERS[kind][0]:
-            self.offer(DECODERS[kind][1](data[1:], t), PRIORITY_STREAM)
+        if data and len(data) >= LENGTHS.get(data[0], math.inf):
+            self.offer(decode_setpoint(data, t), PRIORITY_STREAM)
 
     def manual(self, data: bytes, t: float) -> None:
         """Roll, pitch, yaw rate, thrust: only thrust 0 (stop) and level flight are modelled."""

@@ -66,7 +66,7 @@ def running_fleet(words: Sequence[str]) -> Iterator[str]:
     :raises FleetError: if they do not start.
     """
     process = subprocess.Popen(
-        [sys.executable, "-m", "dtsa_bench.crazyflies.simulated.cli", *words, "--quiet"],
+        [sys.executable, "-m", "dtsa_bench", "fake-crazyflie", *words, "--quiet"],
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,
