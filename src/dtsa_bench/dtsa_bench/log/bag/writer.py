@@ -58,16 +58,14 @@ class BagWriter:
 
     :param directory: where the bag is made; must not exist, or be empty. Parents are made. Or the name of an .mcap file,
         for a bag that is this file alone.
-    :param config: configuration of the run, JSON types only: stored whole in the bag, its `seed` once more
-        by itself; None: the bag says nothing of its origin but `custom_data`.
+    :param config: configuration of the run, JSON types only; None: the bag says nothing of its origin but `custom_data`.
     :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
     :param chunk_size: bytes, size at which a chunk is closed even if its half second is not over.
-    :param custom_data: further texts for `custom_data` of the metadata.
     :param min_time_ns: ns, earliest log time that is accepted.
     :param marked: whether chunks end at a `mark` only; the recorder calls it after each step of the run.
     :param profile: MCAP's name for the conventions that topics and messages follow.
     :raises ConfigError: if the directory is in use or the compression is unknown.
-    :raises BagError: if the directory cannot be made or written to.
+    :raises BagError: if the directory cannot be made or written to; likewise below, for a full disk or a closed bag.
     """
 
     def __init__(
@@ -141,15 +139,11 @@ class BagWriter:
         qos: str | Sequence[metadata.Profile] = "reliable",
         definition: Definition | None = None,
     ) -> int:
-        """Announce a topic; may be done at any time before its first message.
+        """Announce a topic, at any time before its first message; return the channel for `write`.
 
-        :param topic: full name, with its leading slash.
-        :param type_name: "package/msg/Type".
         :param qos: name from `metadata.PROFILES`, or the profiles that its publishers offer.
         :param definition: message definition and type hash; None: those of the installed type.
-        :return: the channel for `write`.
         :raises ConfigError: if the topic is there already or the QoS name is unknown.
-        :raises BagError: if the type is not installed.
         """
         self._check_open()
         if any(channel.topic == topic for channel in self._channels):
@@ -173,15 +167,12 @@ class BagWriter:
     ) -> None:
         """Record one message.
 
-        :param channel: number of the channel, as `add_topic` gave it.
         :param data: the message as CDR, with its encapsulation header.
         :param log_time_ns: ns, simulated time of reception, 1 s or later.
         :param publish_time_ns: ns, simulated time of transmission.
         :param sequence: number of the message on its topic; None: the next one.
-        :raises BagError: if the message cannot be kept: full disk, closed bag.
         """
-        if self._closed or self._failure:
-            self._check_open()
+        self._check_open()
         if log_time_ns < self._min_time_ns:
             raise BagError(f"message at {log_time_ns} ns: times of a bag start at {self._min_time_ns} ns")
         if not 0 < channel <= len(self._channels):
@@ -203,16 +194,13 @@ class BagWriter:
             self.flush()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Store a metadata record of another name than rosbag2's; raises BagError if that fails."""
+        """Store a metadata record of another name than rosbag2's."""
         self.flush()  # such a record stands between chunks
         with self._failing():
             self._mcap.add_metadata(name, dict(values))
 
     def mark(self) -> None:
-        """What has been written until now is a run up to a complete step: a chunk may end here.
-
-        :raises BagError: if what is due cannot be saved.
-        """
+        """What has been written until now is a run up to a complete step: a chunk may end here."""
         if self._marked and (monotonic() >= self._next_flush or self._chunk_bytes > self._chunk_size):
             self.flush()
 
@@ -221,8 +209,6 @@ class BagWriter:
 
         `write`, or `mark` where there are marks, does this by itself every half second of wall time; a recorder that
         may wait long for its next message calls it too.
-
-        :raises BagError: if that fails, on a full disk for example.
         """
         self._check_open()
         with self._failing():
@@ -231,10 +217,7 @@ class BagWriter:
         self._next_flush = monotonic() + FLUSH_S
 
     def close(self) -> None:
-        """Finish the file and write `metadata.yaml`. Further calls do nothing.
-
-        :raises BagError: if the bag could not be finished; `recover` then makes a full bag of it.
-        """
+        """Finish the file and write `metadata.yaml`. Further calls do nothing."""
         if self._closed:
             return
         self._closed = True
