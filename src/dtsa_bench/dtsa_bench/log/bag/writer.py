@@ -24,6 +24,7 @@ from mcap.writer import CompressionType, Writer
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.cdr import RUN_MESSAGES, without_run
 from dtsa_bench import __version__
+from dtsa_bench.runs.options import check_free
 from dtsa_bench.runs.program import program
 
 from . import metadata
@@ -83,8 +84,8 @@ class BagWriter:
             raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
         self.directory = Path(directory)
         self._is_file = self.directory.suffix == ".mcap"
-        if not self._is_file and self.directory.exists() and (not self.directory.is_dir() or any(self.directory.iterdir())):
-            raise ConfigError("directory of the bag", str(directory), "one that is empty or does not exist yet")
+        if not self._is_file:
+            check_free(self.directory, "directory of the bag")
         self.custom_data = dict(custom_data or {})
         if config is not None:
             self.custom_data |= {
@@ -101,16 +102,16 @@ class BagWriter:
         self._digest = BagDigest()
         self._start_ns, self._end_ns = 1 << 63, 0
         self._unsaved = 0  # messages since the last flush
-        self._failure = ""
-        self._closed = False
+        self._ended = ""  # why nothing more can be recorded
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = self.path.open("xb")
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
-        size = _UNLIMITED if marked else chunk_size
-        kind = COMPRESSIONS[compression]
-        self._mcap = Writer(self._stream, chunk_size=size, compression=kind, enable_data_crcs=True)
+        self._mcap = Writer(
+            self._stream, chunk_size=_UNLIMITED if marked else chunk_size, compression=COMPRESSIONS[compression],
+            enable_data_crcs=True,
+        )  # fmt: skip
         with self._failing():
             self._mcap.start(profile=profile, library=f"dtsa {__version__}")
             self._add_own_metadata()
@@ -218,12 +219,7 @@ class BagWriter:
 
     def close(self) -> None:
         """Finish the file and write `metadata.yaml`. Further calls do nothing."""
-        if self._closed:
-            return
-        self._closed = True
-        if self._failure:  # the call that met it has reported it
-            with suppress(OSError):
-                self._stream.close()
+        if self._ended:  # the call that met a failure has reported it
             return
         self.custom_data[KEY] = self._digest.hexdigest()
         with self._failing():
@@ -233,6 +229,7 @@ class BagWriter:
             self._stream.close()
             if not self._is_file:
                 metadata.write(self.directory, self._metadata())
+        self._ended = f"the bag {self.directory} is closed: nothing more can be recorded to it"
 
     def __enter__(self) -> BagWriter:
         return self
@@ -268,8 +265,8 @@ class BagWriter:
         self._mcap.add_metadata(metadata.RECORD_NAME, {metadata.RECORD_KEY: metadata.dump(self._metadata())})
 
     def _check_open(self) -> None:
-        if self._failure or self._closed:
-            raise BagError(self._failure or f"the bag {self.directory} is closed: nothing more can be recorded to it")
+        if self._ended:
+            raise BagError(self._ended)
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
@@ -280,13 +277,13 @@ class BagWriter:
 
     def _fail(self, error: OSError) -> NoReturn:
         lost = f", up to {self._unsaved} messages are not saved" if self._unsaved else ""
-        self._failure = (
+        self._ended = (
             f"recording to {self.path} stopped: {error.strerror or error}{lost}; "
             f"`{program()} recover {self.directory}` makes a full bag of the rest"
         )
         with suppress(OSError):
             self._stream.close()
-        raise BagError(self._failure) from error
+        raise BagError(self._ended) from error
 
 
 class BagDigest:

@@ -90,7 +90,7 @@ class BagContents:
     def check_odometry(self, log: FlightArrays) -> None:
         """Whether odometry is where the records say that the agents were."""
         bodies = [names.body_frame(names.agent_namespace(agent)) for agent in range(1, log.agents + 1)]
-        packer, packed_row, expected = OdometryPacker(bodies, names.FRAME), -1, list[bytes]()
+        packer, packed_row, expected = OdometryPacker(bodies), -1, list[bytes]()
         for slot, agent, data in self._odometry:
             row = slot if log.merged is None else slot - log.first_slot
             if not (0 <= row < len(log) and 1 <= agent <= log.agents and log.known[row, agent - 1]):
