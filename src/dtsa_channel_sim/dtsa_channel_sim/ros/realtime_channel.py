@@ -114,11 +114,11 @@ class LiveAir(Air[SentFrame]):
     def pop_arrived(self, now: int, positions: Positions) -> list[FrameVerdict[SentFrame]]:
         """Return the verdicts on all frames that have arrived."""
         while (due := self.due_ns) <= now - self.hold_ns:
-            self._settle(due, positions)
-        self._settle(now - self._window_ns, positions)
+            self._resolve_until(due, positions)
+        self._resolve_until(now - self._window_ns, positions)
         return self._arriving.pop(now)
 
-    def _settle(self, until_ns: int, positions: Positions) -> None:
+    def _resolve_until(self, until_ns: int, positions: Positions) -> None:
         for verdict in self.resolve(until_ns, positions):
             self._arriving.add(verdict.arrival_ns, verdict)
 
@@ -224,7 +224,7 @@ class RealtimeChannel(RosChannel):
             return bool(stop) or self.lost != absent
 
         present = set(range(1, self.agents + 1)) - absent
-        self.round_ms = roll_call.settle(present, _TIGHT * self.slot_ns / 1e6, is_disturbed)
+        self.round_ms = roll_call.await_short_round(present, _TIGHT * self.slot_ns / 1e6, is_disturbed)
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS

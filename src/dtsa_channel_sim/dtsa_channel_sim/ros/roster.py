@@ -292,7 +292,7 @@ class RollCall:
                     present.update(message.agent)
         return present
 
-    def settle(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
+    def await_short_round(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
         """Call until a round of messages, from a call to the last answer, is short enough, or for some seconds.
 
         Many processes may have found the channel and still look for each other. Return how long the last round took.
