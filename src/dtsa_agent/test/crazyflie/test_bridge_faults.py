@@ -125,12 +125,12 @@ def test_nobody_else_is_harmed(fault_flight: FaultFlight) -> None:
 @pytest.mark.realtime
 def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> None:
     with (
-        fake_fleet(tmp_path, 3, "--layout", "line", "--half-axes", "1.2", "0.6") as fleet,
+        fake_fleet(tmp_path, 3) as fleet,
         flight(settings(fleet, {"safety": {"min_distance_m": 0.35}})) as pilot,
     ):
         pilot.bridge.connect()
         pilot.take_off()
-        pilot.velocity["cf1"] = (0.0, 0.8, 0.0)
+        pilot.velocity["cf1"] = (-0.58, 0.56, 0.0)  # towards cf2
         wait_for(lambda: pilot.state(1) is State.LANDING and pilot.state(2) is State.LANDING)
         assert pilot.state(3) is State.FLYING
         pilot.logged("cf1: distance: 0.3. m from cf2")

@@ -251,7 +251,7 @@ def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fail
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
         helpers = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])}
-        tracked = {"module": "motion_capture_helper", "environment": environment | helpers}
+        tracked = {"program": ("motion_capture_helper",), "environment": environment | helpers}
         with fake_fleet(tmp_path, 4, **tracked) as fleet:  # type: ignore[arg-type]
             station = {
                 "positions": {"source": "pose"},
