@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -50,6 +50,12 @@ class ReceivedFrames(NamedTuple):
     before: Mask  # (H,) before the slot, by an agent that began with it
     data: list[bytes]
 
+    def part(self, first: int, last: int) -> ReceivedFrames:
+        """Those of rows from one to before another."""
+        a, b = np.searchsorted(self.row, (first, last)).tolist()
+        row, *others = (values[a:b] for values in self)
+        return ReceivedFrames(row - first, *others)
+
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class FlightArrays:
@@ -86,7 +92,7 @@ class FlightArrays:
     heard: ReceivedFrames | None = None  # in flights of agents with clocks of their own
     first_slot: int = 0  # number that the agents gave slot 0
     merged: dict[str, Any] | None = None  # what the log was merged from; None: it was recorded as one
-    earlier: FlightArrays | None = None  # of a merged one: slots before the first that all counted alike
+    whole: FlightArrays | None = None  # of a merged one: with the slots before the first that all counted alike
     results: dict[str, Any] | None = None  # the results where they are known already
     notes: list[str] = field(default_factory=list)  # what readers should know of the record
     file: Path | None = None  # where it is recorded
@@ -197,11 +203,6 @@ class FlightArrays:
         rows = np.zeros(0, np.int64) if self.heard is None else self.heard.row
         return [int(end) for end in np.searchsorted(rows, np.arange(len(self) + 1))]
 
-    @property
-    def parts(self) -> list[FlightArrays]:
-        """The slots before the first that all agents of a merged flight counted alike, if there are some, and the rest."""
-        return [self] if self.earlier is None else [self.earlier, self]
-
     @cached_property
     def known_receivers(self) -> NDArray[np.int64]:
         """(F,) other agents of which is known whether they received a frame."""
@@ -311,30 +312,18 @@ def empty_arrays(slots: int, agents: int, steps: int, slot_ns: int) -> dict[str,
 
 
 def split_log(log: Log, slot: int) -> Log:
-    """A log from a slot on; those before are kept as `earlier`.
+    """A log from a slot on; the log itself is kept as its `whole`.
 
     :raises ValueError: if the slot is not in it.
     """
     row = slot - log.first_slot
     if not 0 <= row <= len(log):
         raise ValueError(f"slot {slot}, the first common one, is not in it")
-    later = _slice(log, row, len(log))
-    later.earlier = _slice(log, 0, row) if row else None
-    return later
-
-
-def _slice(log: Log, first: int, last: int) -> Log:
     fields: dict[str, Any] = log.__getstate__()
     for name, values in fields.items():
-        if isinstance(values, np.ndarray) and name not in ("received", "track"):
-            fields[name] = values[first:last]
-    ends = np.concatenate(([0], np.cumsum(log.length.sum(axis=1, dtype=np.int64))))
-    fields["track"] = log.track[first : last + 1]
-    fields["data"] = log.data[int(ends[first]) : int(ends[last])]
-    fields["received"] = log.received[log.sent_ends[first] : log.sent_ends[last]]
-    if log.heard is not None:
-        a, b = log.heard_ends[first], log.heard_ends[last]
-        heard = ReceivedFrames(*(values[a:b] for values in log.heard))
-        fields["heard"] = heard._replace(row=heard.row - first)
-    fields["first_slot"] = log.first_slot + first
-    return type(log)(**fields)
+        if isinstance(values, np.ndarray) and name != "received":
+            fields[name] = values[row:]
+    fields["data"] = log.data[int(log.length[:row].sum(dtype=np.int64)) :]
+    fields["received"] = log.received[log.sent_ends[row] :]
+    fields["heard"] = log.heard and log.heard.part(row, len(log))
+    return type(log)(**fields | {"first_slot": slot, "whole": log})

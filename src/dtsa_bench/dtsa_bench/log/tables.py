@@ -18,8 +18,7 @@ from dtsa_channel_sim.model.verdict import OUTCOMES
 
 from .arrays import FlightArrays, extent_of
 from .bag.errors import BagError
-from .knowledge import knowledge_of, observed, why_without_ages
-from .replay import ObservedPairs
+from .knowledge import ObservedPairs, knowledge_of, observed, why_without_ages
 
 if TYPE_CHECKING:
     import pandas as pd

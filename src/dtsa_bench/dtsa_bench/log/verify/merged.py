@@ -6,8 +6,7 @@ import numpy as np
 
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.errors import UnusableBag
-from dtsa_bench.log.merge.join import receptions_of
-from dtsa_bench.log.merge.merge import clocks_apart
+from dtsa_bench.log.merge.merge import clocks_apart, receptions_of
 from dtsa_bench.log.merged_flight import MergedReplay, check_rules, count_unmatched_frames
 
 from .differences import decision_difference, first_difference
@@ -62,11 +61,12 @@ def _check_receptions(log: FlightArrays) -> None:
 
     :raises Mismatch: at the first difference.
     """
-    for part, (received, lost, outcome) in zip(log.parts, receptions_of(log), strict=True):
-        for name, expected in (("outcome", outcome), ("lost", lost), ("collided", np.zeros_like(lost))):
-            if expected.tobytes() != getattr(part, name).tobytes():
-                raise first_difference(name, expected, getattr(part, name), 0, part)[1]
-        if wrong := np.flatnonzero((part.received != received).any(axis=1)).tolist():
-            row, sender = (int(values[wrong[0]]) for values in part.sent_frames[:2])
-            why = "it follows from what the agents heard"
-            raise Mismatch(Difference("received", "what the agents say", "another mask", why, row, sender))
+    whole = log.whole or log
+    received, lost, outcome = receptions_of(whole)
+    for name, expected in (("outcome", outcome), ("lost", lost), ("collided", np.zeros_like(lost))):
+        if expected.tobytes() != getattr(whole, name).tobytes():
+            raise first_difference(name, expected, getattr(whole, name), 0, whole)[1]
+    if wrong := np.flatnonzero((whole.received != received).any(axis=1)).tolist():
+        row, sender = (int(values[wrong[0]]) for values in whole.sent_frames[:2])
+        why = "it follows from what the agents heard"
+        raise Mismatch(Difference("received", "what the agents say", "another mask", why, row, sender))

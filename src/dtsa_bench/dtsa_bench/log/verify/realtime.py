@@ -133,11 +133,11 @@ def compare_decisions(log: FlightArrays, tags: bool) -> int:
     :param tags: check the tags of frames.
     :raises Mismatch: at the first that is not equal.
     """
-    replay = AgentReplay(log.config.swarm, range(1, log.agents + 1), tags)
+    replay = AgentReplay(log, range(1, log.agents + 1), tags)
     for row in range(len(log)):
         if not log.known[row].all():
             break
-        replay.step(log, row)
+        replay.step(row)
         if replay.differences:
             why = "follows from what the agent says to have taken in"
             raise decision_difference(replay.differences[0], log, why)

@@ -15,8 +15,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
+from dtsa_bench.log.knowledge import MeanAges
 from dtsa_bench.log.merged_bag import open_log
-from dtsa_bench.log.replay import MeanAges
 from dtsa_bench.pages.html import BINS, PALETTE, SCRIPTS, flatten, pack, reduce_bins, render_page, thin, write_page
 from dtsa_bench.runs.delivery import as_sentence, recorded_problem
 from dtsa_channel_sim.model.verdict import OUTCOMES
