@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,10 @@ class MeanAges:
     results: NDArray[np.bool_]  # (S,) slots that the means of a flight take
 
 
-@dataclass(frozen=True, slots=True)
-class ObservedPairs:
+class ObservedPairs(NamedTuple):
     """What each observer knew of each other agent that it had heard, at the end of one slot: P pairs."""
 
-    slot: int
+    slot: NDArray[np.int64]  # (P,)
     observer: NDArray[np.int64]  # (P,) ids
     agent: NDArray[np.int64]  # (P,) ids
     age: NDArray[np.int64]  # slots, (P,)
@@ -105,7 +104,8 @@ def observed(log: FlightArrays) -> Iterator[ObservedPairs]:
             known &= log.known[slot.row, observers - 1][:, None]
         at, column = np.nonzero(known)
         values = [np.broadcast_to(array, known.shape)[at, column] for array in (age, error, expected & slot.counted)]
-        yield ObservedPairs(slot.row, observers[at].astype(np.int64), column + 1, *values)
+        rows = np.full(len(at), slot.row, np.int64)
+        yield ObservedPairs(rows, observers[at].astype(np.int64), column + 1, *values)
 
 
 def _replay_of(log: FlightArrays) -> _WholeReplay | MergedReplay:

@@ -20,7 +20,6 @@ from browser_helpers import serving
 
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.log.knowledge import observed
 from dtsa_bench.log.record import load_log
 from dtsa_bench.pages.view.history import (
     MAX_BYTES,
@@ -70,18 +69,17 @@ def test_ages_and_beliefs_are_those_of_the_report(bag: Path, history: RunHistory
     run = load_log(bag)
     ages = run.knowledge.ages
     assert ages is not None
-    by_slot = {one.slot: one for one in observed(run)}
+    table = run.ages_by_observer
     _, moments = history.since(0, MAX_MOMENTS)
     for moment in moments[3:]:
         told = numbers(json.loads(moment.text)["age"], "<u2")
         known = ages.age[moment.slot - 1]
         assert (told == UNKNOWN).tolist() == np.isnan(known).tolist()
         assert np.nanmax(np.abs(np.where(told == UNKNOWN, np.nan, told) / 10 - known)) <= 0.051
-        one = by_slot[moment.slot - 1]
         for observer in (1, AGENTS):
             heard = np.frombuffer(moment.belief(observer, AGENTS)[0], "<u2")
-            for agent, age in zip(one.agent[one.observer == observer], one.age[one.observer == observer], strict=True):
-                assert heard[agent - 1] == age
+            rows = table[(table.slot == moment.slot - 1) & (table.observer == observer)]
+            assert heard[rows.agent - 1].tolist() == rows.age_slots.tolist()
 
 
 def test_a_history_and_what_waits_for_a_page_are_limited() -> None:
