@@ -302,9 +302,7 @@ def read(path: str | Path) -> AgentBag:
         raise UnusableBag(file, "a message was changed, left out, added or moved after the recording")
     try:
         bag = _make_bag(file, reader.custom, reader.records)
-    except ConfigError as error:
-        raise UnusableBag(file, f"its settings cannot be read ({error})") from None
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
+    except (ConfigError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise UnusableBag(file, f"what it says of its agent cannot be read ({error})") from None
     bag.broken_off = bag.broken_off or not is_finished
     if scan.is_finished or scan.is_closed:
@@ -325,41 +323,34 @@ class _Reader:
     def add(self, record: Any) -> bool:
         """Add a record of the file; return whether it can be used: what follows one that cannot is left out."""
         try:
-            self._add(record)
-        except UnusableBag:
-            raise
+            if isinstance(record, Channel) and record.topic == SLOT_RECORD:
+                self._channel = record.id
+            elif isinstance(record, Schema) and record.name == TYPE:
+                definition = record.data.decode()
+                self._store = shared_typestore(frozenset({(TYPE, definition)}))
+                register_type(self._store, TYPE, definition)
+            elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
+                custom = metadata.custom_data(metadata.load_record(record))
+                self.custom |= custom if AGENT in custom else {}
+            elif isinstance(record, Message) and record.channel_id == self._channel and self.custom:
+                self._add_message(record)
         except NOT_OF_ITS_TYPE:
             return False
         return True
 
-    def _add(self, record: Any) -> None:
-        if isinstance(record, Channel) and record.topic == SLOT_RECORD:
-            self._channel = record.id
-        elif isinstance(record, Schema) and record.name == TYPE:
-            definition = record.data.decode()
-            self._store = shared_typestore(frozenset({(TYPE, definition)}))
-            register_type(self._store, TYPE, definition)
-        elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
-            custom = metadata.custom_data(metadata.load_record(record))
-            self.custom |= custom if AGENT in custom else {}
-        elif isinstance(record, Message) and record.channel_id == self._channel and self.custom:
-            self.digest.add(
-                SLOT_RECORD.encode(), record.log_time, record.publish_time, record.sequence, record.data, True
-            )
-            message = self._store.deserialize_cdr(record.data, TYPE)
-            sizes = {name: math.prod(shape) for name, shape in _shapes(message.steps).items()}
-            columns = [
-                "heard_sender",
-                "heard_slot",
-                "heard_ns",
-                *(["heard_before"] if len(message.heard_before) else []),
-            ]
-            sizes |= dict.fromkeys(columns, len(message.heard_length)) | {"sent_ns": len(message.sender)}
-            for name, size in sizes.items():
-                if len(getattr(message, name)) != size:
-                    raise ValueError(name)
-            cut_frames(message.heard_data, message.heard_length, len(message.heard_sender))
-            self.records.append(message)
+    def _add_message(self, record: Message) -> None:
+        times = record.log_time, record.publish_time, record.sequence
+        self.digest.add(SLOT_RECORD.encode(), *times, record.data, True)
+        message = self._store.deserialize_cdr(record.data, TYPE)
+        count = len(message.heard_sender)
+        sizes = {name: math.prod(shape) for name, shape in _shapes(message.steps).items()}
+        sizes |= {"heard_slot": count, "heard_ns": count, "sent_ns": len(message.sender)}
+        sizes["heard_before"] = count if len(message.heard_before) else 0
+        for name, size in sizes.items():
+            if len(getattr(message, name)) != size:
+                raise ValueError(name)
+        cut_frames(message.heard_data, message.heard_length, count)
+        self.records.append(message)
 
 
 def _shapes(steps: int) -> dict[str, tuple[int, ...]]:
@@ -378,7 +369,7 @@ def _make_bag(file: Path, custom: dict[str, str], records: Sequence[Any]) -> Age
     follows = (np.diff(slots.slot) > 0) | (slots.account["presence"][1:] & NEW != 0)
     if not follows.all():
         row = int(np.argmin(follows))
-        raise UnusableBag(file, f"slot {slots.slot[row + 1]} comes after slot {slots.slot[row]}")
+        raise ValueError(f"slot {slots.slot[row + 1]} comes after slot {slots.slot[row]}")
     agent, senders = int(about["id"]), slots.heard.sender
     if not 1 <= agent <= swarm.agents or (senders < 1).any() or (senders > swarm.agents).any():
         raise ValueError(f"ids of agents that are not among {swarm.agents}")

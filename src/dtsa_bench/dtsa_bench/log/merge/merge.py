@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -30,6 +30,7 @@ _SECTIONS = ("swarm", "limits", "mode")  # of the configuration: there is no sim
 _MAX_SLOT = 0xFFFFFFFF
 
 Processes = Mapping[Process, AgentBag]
+ToCommon = Callable[[NDArray[np.int64]], NDArray[np.int64]]  # times of a process's own clock to the common line, ns
 
 
 class SentDatagram(NamedTuple):
@@ -84,9 +85,14 @@ class Merge:
             "agents_that_gave_up_a_time": sorted({agent for agent, number in self.processes if number < 0}),
         }
         on_line = {process: self.processes[process] for process in clocks if len(self.processes[process].slots.slot)}
-        pace = self.config.slot_ns, slot_ns
-        lines = {process: _CommonTime(clocks[process], zero_ns, *pace) for process in on_line}
-        return _join(on_line, lines, starts.common_slot, round(self.line.flight_ns), about)
+
+        def to_common(clock: Clock) -> ToCommon:
+            return lambda own_ns: np.rint(
+                (clock.common_ns(own_ns) - zero_ns) * self.config.slot_ns / slot_ns
+            ).astype(np.int64)  # fmt: skip
+
+        times = {process: to_common(clocks[process]) for process in on_line}
+        return _join(on_line, times, starts.common_slot, round(self.line.flight_ns), about)
 
     def _about_bags(self) -> dict[str, Any]:
         here, line = {agent for agent, _ in self.processes}, self.line.clocks
@@ -312,30 +318,15 @@ class _SlotStarts:
         return float(np.median(at - length * slots)), length
 
 
-class _CommonTime(NamedTuple):
-    """Makes times of the common line, on which slot i starts at i slot lengths, of those of a process's own clock."""
-
-    clock: Clock
-    zero_ns: float
-    slot_ns: int
-    length_ns: float  # of a slot, by the first clock
-
-    def of(self, own_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Times of the common line, ns."""
-        since = self.clock.common_ns(own_ns) - self.zero_ns
-        return np.rint(since * self.slot_ns / self.length_ns).astype(np.int64)
-
-
 # -- one log ---------------------------------------------------------------------------------------------------------
 def _log_alone(process: Process, bag: AgentBag) -> FlightArrays:
     """The log of a process that shares no time line with others."""
     nothing: dict[str, Any] = {"missing": [], "broken_off": [], "nothing_written": [], "not_on_the_time_line": []}
-    own = _CommonTime(Clock(0, 0.0, 0.0), 0.0, 1, 1.0)
-    return _join({process: bag}, {process: own}, int(bag.slots.slot[0]), 0, nothing)
+    return _join({process: bag}, {process: lambda own_ns: own_ns}, int(bag.slots.slot[0]), 0, nothing)
 
 
 def _join(
-    processes: Processes, times: Mapping[Process, _CommonTime], common_slot: int, flight_ns: int,
+    processes: Processes, times: Mapping[Process, ToCommon], common_slot: int, flight_ns: int,
     about: Mapping[str, Any],
 ) -> FlightLog:  # fmt: skip
     """The log of a flight of which these are the agents' records.
@@ -358,8 +349,8 @@ def _join(
     for process, bag in sorted(processes.items()):
         own, column, row = bag.slots, process[0] - 1, bag.slots.slot - first
         has_sent = np.array([bool(data) for data in own.datagram], np.bool_)
-        sent_ns = np.maximum(0, times[process].of(own.sent_ns))
-        own_ns = np.where(has_sent, sent_ns, times[process].of(own.start_ns))
+        sent_ns = np.maximum(0, times[process](own.sent_ns))
+        own_ns = np.where(has_sent, sent_ns, times[process](own.start_ns))
         arrays["known"][row, column] = True
         arrays["offset_ns"][row, column] = own_ns - arrays["start_ns"][row]
         for name, values in own.account.items():
@@ -370,7 +361,7 @@ def _join(
         by = np.zeros((len(own.heard.row), config.agents), np.bool_)
         by[:, column] = True
         data = [frame_in(one, config) for one in own.heard.data]
-        at_ns = times[process].of(own.heard.time_ns)
+        at_ns = times[process](own.heard.time_ns)
         heard.append(own.heard._replace(row=row[own.heard.row], time_ns=at_ns, receivers=by, data=data))
     taken = _sorted_by_row(heard)
     columns = taken.slot.tolist(), taken.sender.tolist(), taken.time_ns.tolist(), taken.data
