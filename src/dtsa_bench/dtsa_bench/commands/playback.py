@@ -18,7 +18,7 @@ from .registry import RECORDED_RUN, Command
 
 if TYPE_CHECKING:
     from dtsa_bench.log.bag.replay import Player
-    from dtsa_bench.pages.view.page_commands import PageCommand
+    from dtsa_bench.pages.view.history import PageCommand
     from dtsa_bench.pages.view.server import ViewServer
 
 

@@ -151,12 +151,16 @@ class FlightArrays:
 
     @property
     def missing(self) -> str:
-        """Slots and agents of which there is no record, in words; empty: none."""
-        absent = np.flatnonzero(~self.known.any(axis=0)) + 1 if len(self) else np.zeros(0, np.int64)
+        """Slots and agents of which there is no record, as "slots 158 to 313 and the motion of cf2"; empty: none."""
         if not self.is_kept:
             return ""
-        parts = (missing_slots(self.recorded), len(absent) and f"the motion of {', '.join(f'cf{k}' for k in absent)}")
-        return " and ".join(str(part) for part in parts if part)
+        edges = np.flatnonzero(np.diff(np.concatenate(([True], self.recorded, [True])).astype(np.int8)))
+        gaps = [f"{a} to {b - 1}" if a < b - 1 else f"{a}" for a, b in edges.reshape(-1, 2).tolist()]
+        more = f" and {len(gaps) - MAX_GAPS_LISTED} gaps more" if len(gaps) > MAX_GAPS_LISTED else ""
+        absent = np.flatnonzero(~self.known.any(axis=0)).tolist() if len(self) else []
+        parts = [f"slots {', '.join(gaps[:MAX_GAPS_LISTED])}{more}"] if gaps else []
+        parts += [f"the motion of {', '.join(f'cf{column + 1}' for column in absent)}"] if absent else []
+        return " and ".join(parts)
 
     @property
     def outcome_known(self) -> Mask:
@@ -212,7 +216,7 @@ class FlightArrays:
         return np.asarray(frames.received.sum(axis=1) + frames.lost, np.int64)
 
     @cached_property
-    def _instants(self) -> tuple[NDArray[np.int64], Floats, Floats]:
+    def _instants(self) -> tuple[Floats, Floats, Floats]:
         """Times (T,), positions and velocities (T, 3, N) of the control instants at which an agent was recorded."""
         self.check_kept()
         count, steps = self.track.shape[:2]
@@ -224,21 +228,17 @@ class FlightArrays:
             before = np.concatenate((velocity[:1, -1], velocity[:-1, -1]))[:, None]
             velocity[:, :-1] = before + (velocity[:, -1:] - before) * part  # only those at slots' starts are recorded
         times = (np.arange(count)[:, None] - 1) * self.slot_ns + (np.arange(steps) + 1) * self.slot_ns // steps
+        flown = times >= 0
         if self.merged is None:
-            flown = np.isfinite(self.track).all(axis=(2, 3)) & (times >= 0)
+            flown &= np.isfinite(self.track).all(axis=(2, 3))
         else:
-            flown = (times >= 0) & (times <= (count - 1 if self.has_end else count - 2) * self.slot_ns)
-        return times[flown], self.track[flown], velocity[flown]
-
-    @property
-    def instants_ns(self) -> NDArray[np.int64]:
-        """(T,) ns from the start of slot 0: the control instants of `path`."""
-        return self._instants[0]
+            flown &= times <= (count - 1 if self.has_end else count - 2) * self.slot_ns
+        return times[flown] / 1e9, self.track[flown], velocity[flown]
 
     @property
     def instants_s(self) -> Floats:
         """(T,) s from the start of slot 0: the control instants of `path`."""
-        return np.asarray(self._instants[0] / 1e9)
+        return self._instants[0]
 
     @property
     def path(self) -> Floats:
@@ -264,15 +264,6 @@ class FlightArrays:
 
 
 Log = TypeVar("Log", bound=FlightArrays)
-
-
-def missing_slots(recorded: Mask) -> str:
-    """The slots without a record, as "slots 158 to 313"; empty: there are none."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([True], recorded, [True])).astype(np.int8)))
-    gaps = [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
-    words = [f"{first} to {last}" if first < last else f"{first}" for first, last in gaps[:MAX_GAPS_LISTED]]
-    more = f" and {len(gaps) - MAX_GAPS_LISTED} gaps more" if len(gaps) > MAX_GAPS_LISTED else ""
-    return f"slots {', '.join(words)}{more}" if gaps else ""
 
 
 def recorded_config(settings: Mapping[str, Any]) -> RunConfig:

@@ -28,9 +28,10 @@ from dtsa_bench.pages.view.history import (
     UNKNOWN,
     Moment,
     MomentBuilder,
+    PageCommand,
     RunHistory,
+    parse_command,
 )
-from dtsa_bench.pages.view.page_commands import PageCommand, parse_command
 from dtsa_bench.pages.view.server import ViewServer, _PageStream
 from dtsa_channel_sim.model.verdict import SUCCESS
 

@@ -21,7 +21,7 @@ from waiting import wait_for
 
 from dtsa_bench.log.record import load_log
 from dtsa_bench.pages.view.history import MAX_MOMENTS, Moment, RunHistory, VehicleStates
-from dtsa_bench.pages.view.page_commands import PageCommand
+from dtsa_bench.pages.view.history import PageCommand
 from dtsa_bench.pages.view.server import ViewServer
 
 FIGURES = """(() => ({

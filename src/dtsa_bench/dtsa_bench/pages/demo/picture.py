@@ -318,6 +318,6 @@ def draw_animation(path: Path, flights: Flights, slots: int = 80) -> None:
             pictures.append(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
     durations = [FRAME_MS] * (slots - 1) + [LAST_FRAME_MS]
     # In the colours of the last: what does not move does not change, and files stay small.
-    shades = Image.fromarray(pictures[-1]).quantize(255, dither=Image.Dither.NONE)
+    shades = Image.fromarray(pictures[-1]).quantize(255, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     first, *rest = (Image.fromarray(one).quantize(palette=shades, dither=Image.Dither.NONE) for one in pictures)
     first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)

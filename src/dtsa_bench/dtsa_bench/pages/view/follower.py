@@ -20,8 +20,7 @@ from dtsa_bench.log.replay import TableReplay
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.delivery import OncePerFault
 
-from .history import MAX_BELIEVERS, MomentBuilder, RunHistory, run_info
-from .page_commands import PROCESS_COMMANDS
+from .history import MAX_BELIEVERS, PROCESS_COMMANDS, MomentBuilder, RunHistory, run_info
 
 _MAX_CRASH_AGENTS = 100  # in larger swarms no crashes are detected
 _FARTHEST_M = 1e6
