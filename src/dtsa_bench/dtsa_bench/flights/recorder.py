@@ -61,7 +61,7 @@ class FlightRecorder(ChannelObserver):
         self._event = 0
         spaces = [names.agent_namespace(agent) for agent in range(1, agents + 1)]
         self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
-        self._packer = OdometryPacker([names.body_frame(space) for space in spaces], names.FRAME)
+        self._packer = OdometryPacker([names.body_frame(space) for space in spaces])
         self._accounts = None if run.mode == LOCKSTEP else RealtimeAccounts(agents, self._steps, self._slot_ns)
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1

@@ -48,7 +48,7 @@ class SlotMessages:
         self._agents = scenario.start.shape[1]
         self._ids = array("H", range(1, self._agents + 1)).tobytes()
         self._reasons: dict[bytes, tuple[list[bytes], bytes]] = {}
-        self._markers = MarkerPacker([f"cf{agent}" for agent in range(1, self._agents + 1)])
+        self._markers = MarkerPacker(range(1, self._agents + 1))
 
     def decision(self, slot: int, answers: Answers) -> bytes:
         """A dtsa_msgs/Decision as CDR."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -16,11 +15,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic_ns
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.records import Channel, Message, Metadata, Schema
-from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.air.port import PortProperties, PortSettings, flight_ns
@@ -30,20 +28,21 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import pack_received
-from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS, ReceivedFrames
+from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, checksum_fault, register_type, shared_typestore
 from dtsa_bench.log.bag.recover import RecordScan
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
+from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.record import (
     AGENT,
     FORMAT,
     FORMAT_KEY,
     SLOT_RECORD,
     TYPE,
-    cut_frames,
     frame_fields,
+    make_log,
     pack_record,
 )
 from dtsa_bench.runs.config import REALTIME
@@ -59,23 +58,6 @@ _AT_A_TIME = 8  # slots: several at a time take half as long
 _NAME = re.compile(r"cf\d+\.mcap")
 
 
-class AgentSlots(NamedTuple):
-    """What one agent recorded of R slots, ascending but where it took over another time; ns of its own clock."""
-
-    slot: NDArray[np.int64]  # (R,)
-    start_ns: NDArray[np.int64]  # (R,)
-    sent_ns: NDArray[np.int64]  # (R,) when its datagram was handed to the network, where there is one
-    datagram: list[bytes]  # as on the air; empty: none was sent
-    account: dict[str, NDArray[Any]]  # fields of the records, as in a log: (R,), vectors (R, 3), track (R, K, 3)
-    heard: ReceivedFrames  # whole datagrams
-
-    def part(self, first: int, last: int) -> AgentSlots:
-        """The slots of rows from one to before another."""
-        account = {name: values[first:last] for name, values in self.account.items()}
-        slot, start_ns, sent_ns, datagram = (values[first:last] for values in self[:4])
-        return AgentSlots(slot, start_ns, sent_ns, datagram, account, self.heard.part(first, last))
-
-
 @dataclass(slots=True)
 class AgentBag:
     """What one agent recorded of itself."""
@@ -85,7 +67,8 @@ class AgentBag:
     swarm: SwarmConfig
     port: PortProperties
     started_ns: int  # own clock, when its process began
-    slots: AgentSlots
+    log: FlightLog  # one column, its own, as that of agent 1; times of its own clock; frames are whole datagrams
+    earlier: list[FlightLog] = field(default_factory=list)  # slots before it took over a time with smaller numbers
     refused: Counter[str] = field(default_factory=Counter)  # datagrams not accepted, by reason
     summary: dict[str, Any] = field(default_factory=dict)  # its own; empty: it was killed
     broken_off: bool = False  # the file was not finished, or is damaged
@@ -302,7 +285,7 @@ def read(path: str | Path) -> AgentBag:
         raise UnusableBag(file, "a message was changed, left out, added or moved after the recording")
     try:
         bag = _make_bag(file, reader.custom, reader.records)
-    except (ConfigError, KeyError, ValueError, TypeError, AttributeError) as error:
+    except (ConfigError, LookupError, ValueError, TypeError, AttributeError) as error:
         raise UnusableBag(file, f"what it says of its agent cannot be read ({error})") from None
     bag.broken_off = bag.broken_off or not is_finished
     if scan.is_finished or scan.is_closed:
@@ -342,69 +325,41 @@ class _Reader:
         times = record.log_time, record.publish_time, record.sequence
         self.digest.add(SLOT_RECORD.encode(), *times, record.data, True)
         message = self._store.deserialize_cdr(record.data, TYPE)
-        count = len(message.heard_sender)
-        sizes = {name: math.prod(shape) for name, shape in _shapes(message.steps).items()}
-        sizes |= {"heard_slot": count, "heard_ns": count, "sent_ns": len(message.sender)}
-        sizes["heard_before"] = count if len(message.heard_before) else 0
-        for name, size in sizes.items():
-            if len(getattr(message, name)) != size:
-                raise ValueError(name)
-        cut_frames(message.heard_data, message.heard_length, count)
+        if len(message.agent) != 1 or len(message.presence) != 1:
+            raise ValueError("not of one agent")
+        by = pack_received(np.ones((len(message.heard_sender), 1), np.bool_))
+        message.agent, message.sender = np.ones_like(message.agent), np.ones_like(message.sender)  # its only column
+        message.heard_by, message.received = np.frombuffer(by, np.uint8), message.received[:0]
         self.records.append(message)
-
-
-def _shapes(steps: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of what a record says of one agent."""
-    return dict.fromkeys(("presence", *DECIDED), ()) | dict.fromkeys(VECTORS, (3,)) | {"track": (steps, 3)}
 
 
 def _make_bag(file: Path, custom: dict[str, str], records: Sequence[Any]) -> AgentBag:
     """The bag of the agent that a file's metadata describes."""
     about, summary = json.loads(custom[AGENT]), json.loads(custom.get(SUMMARY, "{}"))
     swarm = SwarmConfig.from_dict(json.loads(custom["configuration"])["swarm"])
-    if BROKEN_OFF in custom:  # `recover` has made this file of one that was not finished, or is damaged
-        whole_ns = int(custom[BROKEN_OFF])
-        records = [record for record in records if _stamp_ns(record) <= whole_ns]
-    slots = _gather_slots(records, int(about["zero_ns"]) - names.TIME_ZERO_NS, swarm.steps)
-    follows = (np.diff(slots.slot) > 0) | (slots.account["presence"][1:] & NEW != 0)
-    if not follows.all():
-        row = int(np.argmin(follows))
-        raise ValueError(f"slot {slots.slot[row + 1]} comes after slot {slots.slot[row]}")
-    agent, senders = int(about["id"]), slots.heard.sender
-    if not 1 <= agent <= swarm.agents or (senders < 1).any() or (senders > swarm.agents).any():
-        raise ValueError(f"ids of agents that are not among {swarm.agents}")
+    agent, started_ns, zero_ns = (int(about[name]) for name in ("id", "started_ns", "zero_ns"))
+    whole_ns = int(custom.get(BROKEN_OFF, 1 << 63))  # `recover` has made this file of one that was not finished
+    times: list[list[Any]] = [[]]  # records, of each time that the agent has taken over
+    for record in records:
+        if record.header.stamp.sec * 1_000_000_000 + record.header.stamp.nanosec > whole_ns:
+            continue
+        if times[-1] and record.slot <= times[-1][-1].slot:
+            if not record.presence[0] & NEW:
+                raise ValueError(f"slot {record.slot} comes after slot {times[-1][-1].slot}")
+            times.append([])
+        times[-1].append(record)
+    logs = [
+        make_log(part, 1, swarm.slot_ns, False, file.stem, {"swarm": swarm.to_dict(), "mode": REALTIME})
+        for part in times
+    ]
+    for log in logs:
+        assert log.heard is not None
+        log.start_ns += zero_ns
+        log.heard.time_ns[:] += zero_ns
+        if not (1 <= agent <= swarm.agents and np.isin(log.heard.sender, range(1, swarm.agents + 1)).all()):
+            raise ValueError(f"ids of agents that are not among {swarm.agents}")
+    refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})
     return AgentBag(
-        file, agent, swarm, PortProperties(**about["port"]), int(about["started_ns"]), slots,
-        Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()}), summary,
+        file, agent, swarm, PortProperties(**about["port"]), started_ns, logs[-1], logs[:-1], refused, summary,
         broken_off=BROKEN_OFF in custom, goals_told=bool(about["goals_told"]),
-    )  # fmt: skip
-
-
-def _stamp_ns(record: Any) -> int:
-    return int(record.header.stamp.sec) * 1_000_000_000 + int(record.header.stamp.nanosec)
-
-
-def _gather_slots(records: Sequence[Any], zero_ns: int, steps: int) -> AgentSlots:
-    """Decoded records as arrays; `zero_ns`: what the agent's clock shows at time 0 of the record."""
-
-    def column(name: str) -> NDArray[Any]:
-        return np.concatenate([np.zeros(0, np.uint8), *(getattr(record, name) for record in records)])
-
-    start_ns = np.array([zero_ns + _stamp_ns(record) for record in records], np.int64)
-    sent_ns = [int(record.sent_ns[0]) if len(record.sent_ns) else 0 for record in records]
-    counts = [len(record.heard_sender) for record in records]
-    row = np.repeat(np.arange(len(records)), counts)
-    sender, slot, at_ns = (column(name).astype(np.int64) for name in ("heard_sender", "heard_slot", "heard_ns"))
-    before = np.zeros(len(row), np.bool_)
-    for record, end in zip(records, np.cumsum(counts, dtype=np.int64).tolist(), strict=True):
-        if len(record.heard_before):
-            before[end - len(record.heard_before) : end] = record.heard_before
-    heard = ReceivedFrames(
-        row, sender, slot, start_ns[row] + at_ns, np.ones((len(row), 1), np.bool_), before,
-        cut_frames(column("heard_data"), column("heard_length"), len(row)),
-    )  # fmt: skip
-    return AgentSlots(
-        np.array([record.slot for record in records], np.int64), start_ns, start_ns + np.array(sent_ns, np.int64),
-        [record.data.tobytes() for record in records],
-        {name: column(name).reshape(-1, *shape) for name, shape in _shapes(steps).items()}, heard,
     )  # fmt: skip

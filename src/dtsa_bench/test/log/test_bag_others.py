@@ -26,8 +26,8 @@ from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
-from dtsa_bench.log.record import load_log
 from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.log.record import load_log
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig

@@ -120,8 +120,12 @@ def test_a_computer_reads_what_the_app_on_board_says(auth: bool, tmp_path: Path)
     heard = CrazyradioSettings(uri="radio://0/80/2M")
     assert port == heard.p2p_port
     datagrams = StationSettings(swarm, link_of(swarm, heard.properties), authenticator(swarm))
-    bags = [read(tmp_path / f"cf{k}.mcap").slots for k in (1, 2, 3)]
-    said = [(slot, data) for bag in bags for slot, data in zip(bag.slot.tolist(), bag.datagram, strict=True) if data]
+    logs = [read(tmp_path / f"cf{k}.mcap").log for k in (1, 2, 3)]
+    said = [
+        (log.first_slot + row, data)
+        for log in logs
+        for row, data in zip(log.sent_frames.row.tolist(), log.sent_frames.data, strict=True)
+    ]
     assert len(said) > 100
     for slot, sent in said:
         datagram = datagram_in(broadcast(sent, heard.p2p_port)[5:], heard.p2p_port)

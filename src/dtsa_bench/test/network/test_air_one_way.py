@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.air.port import NETWORK
-from dtsa_agent.air.settings import UdpSettings
+from dtsa_agent.air.record import SlotRecord
+from dtsa_agent.air.settings import AgentSettings, UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
-from dtsa_bench.log.agent_bag import AgentBag, AgentSlots, NothingWritten, read
-from dtsa_bench.log.arrays import ReceivedFrames
+from dtsa_bench.log.agent_bag import AgentBag, AgentRecorder, NothingWritten, read
+from dtsa_bench.log.arrays import split_log
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merge.timeline import Crossings, both_ways, fit
 from dtsa_bench.log.merged_flight import count_unmatched_frames, slots_until_all_known
@@ -105,7 +105,7 @@ def test_an_agent_that_wrote_nothing_is_named_and_the_others_are_merged(bags, tm
 def test_frames_of_a_process_that_wrote_nothing_are_no_lies(bags, tmp_path, capsys):
     """cf2 was killed before it wrote, and its frames were heard; then it came back, and was heard, too."""
     later = read(bags[1])
-    later.slots = later.slots.part(len(later.slots.slot) // 2, len(later.slots.slot))
+    later.log = split_log(later.log, later.log.first_slot + len(later.log) // 2)
     assert Merge([read(bags[0]), later]).summary()["frames_heard_not_as_sent"] > 0
     assert Merge([read(bags[0]), later], ["runs/cf2"]).summary()["frames_heard_not_as_sent"] == 0
 
@@ -113,7 +113,7 @@ def test_frames_of_a_process_that_wrote_nothing_are_no_lies(bags, tmp_path, caps
 def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: list[Path]) -> None:
     """It holds only the time of all: what cf2 sent before it took that over is heard, and not known as sent."""
     later = read(bags[1])
-    later.slots = later.slots.part(len(later.slots.slot) // 2, len(later.slots.slot))
+    later.log = split_log(later.log, later.log.first_slot + len(later.log) // 2)
     log = Merge([read(bags[0]), later]).log
     assert count_unmatched_frames(log) > 0
     for agents, is_right in (([2], True), ([1], False)):
@@ -124,12 +124,11 @@ def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: 
 def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:
     ones = [read(path) for path in bags[:2]]
     before = Merge(ones).summary()["flight"]
-    slots = ones[1].slots
-    first, last = int(slots.slot[0]), int(slots.slot[-1])
+    log = ones[1].log
+    first, last = log.first_slot, log.first_slot + len(log) - 1
     since = first + (last - first) // 2
     assert last - since > 2 * slots_until_all_known(CONFIG)
-    heard = slots.heard.part(0, int(np.searchsorted(slots.slot, since)))
-    ones[1].slots = slots._replace(heard=heard)  # cf2 heard nothing in the second half
+    log.heard = log.heard.part(0, since - first)  # cf2 heard nothing in the second half
     after = Merge(ones).summary()["flight"]
     assert before["heard_age_max_slots"] < after["heard_age_max_slots"] <= last - since + before["heard_age_max_slots"]
     assert after["heard_age_max_slots"] > (last - since) * 0.8
@@ -178,16 +177,19 @@ def test_clocks_are_fit_within_groups_connected_both_ways() -> None:
     assert line.flight_ns == pytest.approx(MS, abs=50_000)
 
 
-def test_slots_of_times_that_were_given_up_are_kept_apart() -> None:
+def test_slots_of_times_that_were_given_up_are_kept_apart(tmp_path: Path) -> None:
     """Two processes of an agent, each of which took over a time with smaller slot numbers."""
+    zero, track = np.zeros(3), np.zeros((CONFIG.steps, 3))
 
-    def process(slots: list[int]) -> AgentBag:
-        times, nothing = np.zeros((2, len(slots)), np.int64), np.zeros(0, np.int64)
-        heard = ReceivedFrames(*[nothing] * 4, np.zeros((0, 1), np.bool_), np.zeros(0, np.bool_), [])
-        records = AgentSlots(np.array(slots), *times, [b""] * len(slots), {}, heard)
-        return AgentBag(Path("cf1.mcap"), 1, CONFIG, NETWORK, 0, records)
+    def process(name: str, slots: list[int]) -> AgentBag:
+        with AgentRecorder(tmp_path / name, AgentSettings(id=1), CONFIG, UdpSettings(interface="lo")) as recorder:
+            for at, slot in enumerate(slots):
+                is_first = at == 0 or slot < slots[at - 1]
+                recorder.slot(SlotRecord(slot, 0, 0, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
+        return read(tmp_path / name)
 
-    processes = Merge([process([70, 71, 3, 4]), process([90, 91, 80, 5, 6])]).processes
-    assert {process: bag.slots.slot.tolist() for process, bag in processes.items()} == {
+    bags = [process("a.mcap", [70, 71, 3, 4]), process("b.mcap", [90, 91, 80, 5, 6])]
+    slots = {key: np.flatnonzero(bag.log.known) + bag.log.first_slot for key, bag in Merge(bags).processes.items()}
+    assert {key: values.tolist() for key, values in slots.items()} == {
         (1, 0): [3, 4], (1, 1): [5, 6], (1, -1): [70, 71], (1, -2): [80], (1, -3): [90, 91],
     }  # fmt: skip

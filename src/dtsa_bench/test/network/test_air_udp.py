@@ -131,7 +131,7 @@ def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
     def numbers(text: str, kind: str) -> Any:
         return np.frombuffer(base64.b64decode(text), kind)
 
-    records = {agent: read(path).slots for agent, path in enumerate(flight.bags, 1)}
+    records = {agent: read(path).log for agent, path in enumerate(flight.bags, 1)}
     heard = [
         pair
         for moment in flight.told
@@ -143,10 +143,7 @@ def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
     ]
     assert len(heard) > 60
     sent = {
-        (slot, agent)
-        for agent, found in records.items()
-        for slot, datagram in zip(found.slot.tolist(), found.datagram, strict=True)
-        if datagram
+        (log.first_slot + row, agent) for agent, log in records.items() for row in np.flatnonzero(log.sent).tolist()
     }
     assert set(heard) <= sent
     assert len(set(heard)) == len(heard)
@@ -156,8 +153,8 @@ def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
     slot = numbers(middle["at"], "<u4")[-1]
     place = numbers(middle["place"], "<f4").reshape(-1, 3, CONFIG.agents)[-1]
     for agent in (1, 2, 3):
-        row = np.searchsorted(records[agent].slot, slot)
-        assert np.linalg.norm(place[:, agent - 1] - records[agent].account["track"][row, -1]) < 0.1
+        track = records[agent].track[slot - records[agent].first_slot, -1, :, 0]
+        assert np.linalg.norm(place[:, agent - 1] - track) < 0.1
     words = "\n".join(event[2] for moment in flight.told for event in moment["events"])
     assert all(f"cf{agent} is heard" in words and f"cf{agent} leaves" in words for agent in (1, 2, 3))
     assert "cf4" not in words
@@ -168,17 +165,18 @@ def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
 
 def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespace, tmp_path: Path) -> None:
     bags = [read(path) for path in flight.bags]
-    said = bags[0].slots
-    said.account["chosen"][-20] = 4 if said.account["chosen"][-20] != 4 else 1
+    log = bags[0].log
+    row = int(np.flatnonzero(log.known)[-20])
+    log.chosen[row] = 4 if log.chosen[row, 0] != 4 else 1
     found = Merge(bags).summary()
     assert not is_verified(found)
     assert [(one["agent"], one["slot"], one["field"]) for one in found["decisions_again"]["differences"]] == [
-        (1, said.slot[-20], "chosen")
+        (1, log.first_slot + row, "chosen")
     ]
     bags = [read(path) for path in flight.bags]
-    sent = bags[1].slots.datagram
-    at = next(k for k in range(-60, 0) if sent[k])
-    sent[at] = sent[at][:-5] + bytes([sent[at][-5] ^ 1]) + sent[at][-4:]
+    frames = bags[1].log.sent_frames
+    at = np.flatnonzero(frames.row > len(bags[1].log) - 60)[0]
+    frames.data[at] = frames.data[at][:-5] + bytes([frames.data[at][-5] ^ 1]) + frames.data[at][-4:]
     assert Merge(bags).summary()["frames_heard_not_as_sent"] > 0
     for number, name in enumerate(("chosen", "digest", "lost", "received", "data", "odom")):
         with Bag(flight.whole) as bag, BagWriter(tmp_path / f"{number}", None, custom_data=bag.custom_data) as copy:
@@ -213,12 +211,13 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Pa
     cut.write_bytes(whole[: len(whole) * 2 // 3])
     bag = read(cut)
     assert bag.broken_off
-    assert 0 < len(bag.slots.slot) < len(read(flight.bags[0]).slots.slot)
+    assert 0 < len(bag.log) < len(read(flight.bags[0]).log)
     found = Merge([bag, *(read(path) for path in flight.bags[1:])]).summary()
     assert found["broken_off"] == ["cf1"]
     assert is_verified(found)
     saved = read(recover(cut).directory)
-    assert saved.slots.slot.tolist() == bag.slots.slot.tolist()
+    assert saved.log.known.tolist() == bag.log.known.tolist()
+    assert saved.log.first_slot == bag.log.first_slot
     again = Merge([saved, *(read(path) for path in flight.bags[1:])]).summary()
     assert {**again, "broken_off": []} == {**found, "broken_off": []}, again
     assert again["broken_off"] == ["cf1"]
@@ -317,7 +316,7 @@ def test_bags_that_do_not_belong_together_are_refused(flight: SimpleNamespace) -
         Merge([]).summary()
     deaf = read(flight.bags[1])
     for bag in (one, deaf):
-        bag.slots = bag.slots._replace(heard=bag.slots.heard.part(0, 0))
+        bag.log.heard = bag.log.heard.part(0, 0)
     apart = Merge([one, deaf])
     with pytest.raises(ConfigError, match=r"hear each other|do not go both ways"):
         _ = apart.log

@@ -6,7 +6,6 @@ import dataclasses
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from dtsa_agent.air.port import frame_in
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.agent_bag import AgentBag
-from dtsa_bench.log.arrays import UNKNOWN, FlightArrays, ReceivedFrames, empty_arrays, split_log
+from dtsa_bench.log.arrays import DECIDED, UNKNOWN, VECTORS, FlightArrays, ReceivedFrames, empty_arrays, split_log
 from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.merged_flight import MergedReplay, check_rules, run_of
@@ -67,7 +66,7 @@ class Merge:
         starts, clocks = self._starts, self.line.clocks
         if starts.common_slot is None and len(self.processes) == 1:  # there is nothing to compare the one clock with
             ((process, bag),) = self.processes.items()
-            clocks = {process: Clock(int(bag.slots.start_ns[0]), 0.0, 0.0)}
+            clocks = {process: Clock(int(bag.log.start_ns[0]), 0.0, 0.0)}
             starts = _SlotStarts(self.processes, clocks, self.config.slot_ns)
         if starts.common_slot is None:
             why = "bags of agents that hear each other and come to count slots alike"
@@ -84,7 +83,7 @@ class Merge:
             "slot_on_the_first_clock_ns": slot_ns,
             "agents_that_gave_up_a_time": sorted({agent for agent, number in self.processes if number < 0}),
         }
-        on_line = {process: self.processes[process] for process in clocks if len(self.processes[process].slots.slot)}
+        on_line = {process: self.processes[process] for process in clocks if len(self.processes[process].log)}
 
         def to_common(clock: Clock) -> ToCommon:
             return lambda own_ns: np.rint(
@@ -115,18 +114,18 @@ class Merge:
         alone = [
             MergedReplay(_log_alone(process, bag)).run()  # slots of its own, which are nobody else's
             for process, bag in processes.items()
-            if len(bag.slots.slot) and not (has_common and process in line.clocks)
+            if len(bag.log) and not (has_common and process in line.clocks)
         ]
         replays = [*([joined] if joined else []), *alone]
         refused: Counter[str] = sum((bag.refused for bag in processes.values()), Counter())
-        lengths, here = [len(bag.slots.slot) for bag in processes.values()], {agent for agent, _ in processes}
-        heard = sum(len(bag.slots.heard.row) for bag in processes.values())
+        lengths, here = [int(bag.log.known.sum()) for bag in processes.values()], {agent for agent, _ in processes}
+        heard = sum(len(_heard_by(bag).row) for bag in processes.values())
         delivery = counts_of_datagrams(len(here), max(lengths), len(self.sent), heard, refused)
         held = {process_name(process): bag.summary.get("held_slots") for process, bag in processes.items()}
         rules = check_rules(self.log, joined.unsent) if joined else RuleChecker(self.config)
         return {
             "bags": sum(number >= 0 for _, number in processes),
-            "slots_of_times_given_up": sum(len(bag.slots.slot) for (_, number), bag in processes.items() if number < 0),
+            "slots_of_times_given_up": sum(lengths[k] for k, (_, number) in enumerate(processes) if number < 0),
             **self._about_bags(),
             "time_line": line.summary(),
             **self._starts.summary(),
@@ -182,12 +181,10 @@ def clocks_apart(groups: Sequence[Sequence[str]]) -> str:
 # -- processes and what they share -----------------------------------------------------------------------------------
 def _processes(bags: Sequence[AgentBag]) -> dict[Process, AgentBag]:
     """The bags by agent and process."""
-    if not any(len(bag.slots.slot) for bag in bags):
+    if not any(len(bag.log) for bag in bags):
         raise ConfigError("bags", str(bags[0].path) if bags else "", "bags with a slot in them")
     found: dict[Process, AgentBag] = {}
-    times = [_split_times(bag) for bag in bags]
-    last = [parts[-1] for parts in times]
-    for bag in sorted(last, key=lambda bag: (bag.agent, _first_slot(bag))):
+    for bag in sorted(bags, key=lambda bag: (bag.agent, bag.log.first_slot if len(bag.log) else -1)):
         if bag.swarm != bags[0].swarm:
             theirs, ours = bag.swarm.to_dict(), bags[0].swarm.to_dict()
             other = ", ".join(
@@ -196,25 +193,20 @@ def _processes(bags: Sequence[AgentBag]) -> dict[Process, AgentBag]:
             raise ConfigError("bag", str(bag.path), f"one of the same flight as {bags[0].path}: {other}")
         number = sum(agent == bag.agent for agent, _ in found)
         before = found.get((bag.agent, number - 1))
-        if before is not None and _first_slot(bag) <= max(before.slots.slot.tolist(), default=-2):
+        if before is not None and bag.log.first_slot < before.log.first_slot + len(before.log):
             raise ConfigError("bag", str(bag.path), f"one process of cf{bag.agent} at a time: {before.path} is another")
         found[(bag.agent, number)] = bag
-    for parts in times:  # what it flew before it took over a time with smaller numbers: processes of negative ones
-        for part in reversed(parts[:-1]):
-            number = -1 - sum(agent == part.agent and number < 0 for agent, number in found)
-            found[(part.agent, number)] = dataclasses.replace(part, summary={}, refused=Counter())
+    for bag in bags:  # what it flew before it took over a time with smaller numbers: processes of negative ones
+        for log in reversed(bag.earlier):
+            number = -1 - sum(agent == bag.agent and number < 0 for agent, number in found)
+            found[(bag.agent, number)] = dataclasses.replace(bag, log=log, summary={}, refused=Counter())
     return found
 
 
-def _first_slot(bag: AgentBag) -> int:
-    return int(bag.slots.slot[0]) if len(bag.slots.slot) else -1
-
-
-def _split_times(bag: AgentBag) -> list[AgentBag]:
-    """A bag, split where the slots of its agent count back: there it took over another time."""
-    back = np.flatnonzero(np.diff(bag.slots.slot) <= 0) + 1
-    edges = [0, *back.tolist(), len(bag.slots.slot)]
-    return [dataclasses.replace(bag, slots=bag.slots.part(a, b)) for a, b in pairwise(edges)]
+def _heard_by(bag: AgentBag) -> ReceivedFrames:
+    """What the agent of a bag heard."""
+    assert bag.log.heard is not None
+    return bag.log.heard
 
 
 def _groups_apart(processes: Processes, line: TimeLine) -> list[list[str]]:
@@ -224,20 +216,20 @@ def _groups_apart(processes: Processes, line: TimeLine) -> list[list[str]]:
     """
     sharing = {process for group in line.groups for process in group}
     alone = [(process,) for process in processes if process not in sharing and process[1] >= 0]
-    groups = [group for group in (*line.groups, *alone) if any(any(processes[one].slots.datagram) for one in group)]
+    groups = [group for group in (*line.groups, *alone) if any(processes[one].log.sent.any() for one in group)]
     return [[process_name(process) for process in group] for group in groups] if len(groups) > 1 else []
 
 
 def _sent_datagrams(processes: Processes) -> dict[tuple[int, int], SentDatagram]:
     """All datagrams that were sent, by slot and sender."""
-    return {
-        (slot, process[0]): SentDatagram(process, sent_ns, data)
-        for process, bag in sorted(processes.items())
-        for slot, sent_ns, data in zip(
-            bag.slots.slot.tolist(), bag.slots.sent_ns.tolist(), bag.slots.datagram, strict=True
-        )
-        if data
-    }
+    sent = {}
+    for process, bag in sorted(processes.items()):
+        log, frames = bag.log, bag.log.sent_frames
+        assert log.sent_ns is not None
+        times_ns = log.start_ns[frames.row] + log.sent_ns[frames.row, 0]
+        for row, sent_ns, data in zip(frames.row.tolist(), times_ns.tolist(), frames.data, strict=True):
+            sent[log.first_slot + row, process[0]] = SentDatagram(process, sent_ns, data)
+    return sent
 
 
 def _crossings(
@@ -253,7 +245,7 @@ def _crossings(
     count = unmatched = 0
     rows: list[tuple[int, int, int, int]] = []
     for receiver, bag in processes.items():
-        heard = bag.slots.heard
+        heard = _heard_by(bag)
         columns = heard.slot.tolist(), heard.sender.tolist(), heard.time_ns.tolist(), heard.data
         for slot, sender, arrival_ns, data in zip(*columns, strict=True):
             origin = sent.get((slot, sender))
@@ -274,7 +266,11 @@ class _SlotStarts:
     def __init__(self, processes: Processes, clocks: Mapping[Process, Clock], slot_ns: int) -> None:
         self._slot_ns = slot_ns
         on_line = [(process, clocks[process], bag) for process, bag in processes.items() if process in clocks]
-        starts = [(bag.slots.slot, clock.common_ns(bag.slots.start_ns)) for _, clock, bag in on_line]
+        rows = [np.flatnonzero(bag.log.known) for _, _, bag in on_line]
+        starts = [
+            (row + bag.log.first_slot, clock.common_ns(bag.log.start_ns[row]))
+            for row, (_, clock, bag) in zip(rows, on_line, strict=True)
+        ]
         first = [int(clock.common_ns(bag.started_ns)) for process, clock, bag in on_line if process[1] == 0]
         self._started_ns = max(first, default=None)
         self._slot = np.unique(np.concatenate([np.zeros(0, np.int64), *(slots for slots, _ in starts)]))
@@ -322,7 +318,7 @@ class _SlotStarts:
 def _log_alone(process: Process, bag: AgentBag) -> FlightArrays:
     """The log of a process that shares no time line with others."""
     nothing: dict[str, Any] = {"missing": [], "broken_off": [], "nothing_written": [], "not_on_the_time_line": []}
-    return _join({process: bag}, {process: lambda own_ns: own_ns}, int(bag.slots.slot[0]), 0, nothing)
+    return _join({process: bag}, {process: lambda own_ns: own_ns}, bag.log.first_slot, 0, nothing)
 
 
 def _join(
@@ -337,9 +333,10 @@ def _join(
     :raises BagError: if most slots are missing.
     """
     config = next(iter(processes.values())).swarm
-    slots = np.unique(np.concatenate([bag.slots.slot for bag in processes.values()]))
-    first, last = int(slots[0]), int(slots[-1])
-    if last - first >= 2 * len(slots) + 1000 or last > _MAX_SLOT:
+    first = min(bag.log.first_slot for bag in processes.values())
+    last = max(bag.log.first_slot + len(bag.log) for bag in processes.values()) - 1
+    count = len({slot for bag in processes.values() for slot in np.flatnonzero(bag.log.known) + bag.log.first_slot})
+    if last - first >= 2 * count + 1000 or last > _MAX_SLOT:
         raise BagError(f"no agent tells of most of the slots {first} to {last}: no flight to record")
     arrays = empty_arrays(last - first + 1, config.agents, config.steps, config.slot_ns)
     arrays["start_ns"] += first * config.slot_ns
@@ -347,22 +344,27 @@ def _join(
     frames: dict[tuple[int, int], tuple[int, bytes]] = {}  # by row and sender: when, and what
     heard: list[ReceivedFrames] = []
     for process, bag in sorted(processes.items()):
-        own, column, row = bag.slots, process[0] - 1, bag.slots.slot - first
-        has_sent = np.array([bool(data) for data in own.datagram], np.bool_)
-        sent_ns = np.maximum(0, times[process](own.sent_ns))
-        own_ns = np.where(has_sent, sent_ns, times[process](own.start_ns))
+        log, frames_sent, heard_frames = bag.log, bag.log.sent_frames, _heard_by(bag)
+        own, column, to_common = np.flatnonzero(log.known), process[0] - 1, times[process]
+        row = own + log.first_slot - first
+        assert log.sent_ns is not None
+        sent_ns = np.maximum(0, to_common(log.start_ns[own] + log.sent_ns[own, 0]))
+        own_ns = np.where(log.sent[own, 0], sent_ns, to_common(log.start_ns[own]))
         arrays["known"][row, column] = True
         arrays["offset_ns"][row, column] = own_ns - arrays["start_ns"][row]
-        for name, values in own.account.items():
-            arrays[name][row, ..., column] = values
-        for at, ns, data in zip(row.tolist(), own_ns.tolist(), own.datagram, strict=True):
-            if data:
-                frames[at, column + 1] = ns, frame_in(data, config)
-        by = np.zeros((len(own.heard.row), config.agents), np.bool_)
+        for name in (*DECIDED, *VECTORS, "presence", "track"):
+            arrays[name][row, ..., column] = getattr(log, name)[own, ..., 0]
+        offset = log.first_slot - first
+        for at, data in zip(frames_sent.row + offset, frames_sent.data, strict=True):
+            frames[int(at), column + 1] = (
+                int(arrays["offset_ns"][at, column] + arrays["start_ns"][at]),
+                frame_in(data, config),
+            )
+        by = np.zeros((len(heard_frames.row), config.agents), np.bool_)
         by[:, column] = True
-        data = [frame_in(one, config) for one in own.heard.data]
-        at_ns = times[process](own.heard.time_ns)
-        heard.append(own.heard._replace(row=row[own.heard.row], time_ns=at_ns, receivers=by, data=data))
+        data = [frame_in(one, config) for one in heard_frames.data]
+        times_ns = to_common(heard_frames.time_ns)
+        heard.append(heard_frames._replace(row=heard_frames.row + offset, time_ns=times_ns, receivers=by, data=data))
     taken = _sorted_by_row(heard)
     columns = taken.slot.tolist(), taken.sender.tolist(), taken.time_ns.tolist(), taken.data
     for slot, sender, arrival_ns, data in zip(*columns, strict=True):  # frames of agents of which there is no record
@@ -398,8 +400,8 @@ def _describe(process: Process, bag: AgentBag) -> dict[str, Any]:
         "agent": process[0],
         "process": process_name(process),
         "bag": str(bag.path),
-        "first": int(bag.slots.slot[0]),
-        "last": int(bag.slots.slot[-1]),
+        "first": bag.log.first_slot,
+        "last": bag.log.first_slot + len(bag.log) - 1,
         "goals_told": bag.goals_told,
         "ended_in_order": bool(bag.summary),
         "broken_off": bag.broken_off,
