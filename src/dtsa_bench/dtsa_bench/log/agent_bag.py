@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.records import Channel, Message, Metadata, Schema
+from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.air.port import PortProperties, PortSettings, flight_ns
@@ -28,7 +29,7 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import pack_received
-from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS
+from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS, ReceivedFrames
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, checksum_fault, register_type, shared_typestore
@@ -74,6 +75,29 @@ class AgentBag:
     broken_off: bool = False  # the file was not finished, or is damaged
     damage: str = ""  # why a finished file is not as it was finished; empty: it is
     goals_told: bool = False  # it was told goals in flight: none was known to be its last
+
+    @property
+    def slots(self) -> NDArray[np.int64]:
+        """(R,) slots of which there is a record."""
+        return np.flatnonzero(self.log.known) + self.log.first_slot
+
+    @property
+    def start_ns(self) -> NDArray[np.int64]:
+        """(R,) when these started."""
+        return self.log.start_ns[self.log.known[:, 0]]
+
+    @property
+    def sent_ns(self) -> NDArray[np.int64]:
+        """(F,) when each frame of the log was handed to the network."""
+        row = self.log.sent_frames.row
+        assert self.log.sent_ns is not None
+        return self.log.start_ns[row] + self.log.sent_ns[row, 0]
+
+    @property
+    def heard(self) -> ReceivedFrames:
+        """What the agent heard."""
+        assert self.log.heard is not None
+        return self.log.heard
 
     @property
     def flight_ns(self) -> int:

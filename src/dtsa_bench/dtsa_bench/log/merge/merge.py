@@ -26,7 +26,6 @@ from .timeline import Clock, Crossings, Process, TimeLine, fit, process_name
 
 _END = 50  # slots
 _SECTIONS = ("swarm", "limits", "mode")  # of the configuration: there is no simulated channel, and no simulated clocks
-_MAX_SLOT = 0xFFFFFFFF
 
 Processes = Mapping[Process, AgentBag]
 ToCommon = Callable[[NDArray[np.int64]], NDArray[np.int64]]  # times of a process's own clock to the common line, ns
@@ -118,8 +117,8 @@ class Merge:
         ]
         replays = [*([joined] if joined else []), *alone]
         refused: Counter[str] = sum((bag.refused for bag in processes.values()), Counter())
-        lengths, here = [int(bag.log.known.sum()) for bag in processes.values()], {agent for agent, _ in processes}
-        heard = sum(len(_heard_by(bag).row) for bag in processes.values())
+        lengths, here = [len(bag.slots) for bag in processes.values()], {agent for agent, _ in processes}
+        heard = sum(len(bag.heard.row) for bag in processes.values())
         delivery = counts_of_datagrams(len(here), max(lengths), len(self.sent), heard, refused)
         held = {process_name(process): bag.summary.get("held_slots") for process, bag in processes.items()}
         rules = check_rules(self.log, joined.unsent) if joined else RuleChecker(self.config)
@@ -203,12 +202,6 @@ def _processes(bags: Sequence[AgentBag]) -> dict[Process, AgentBag]:
     return found
 
 
-def _heard_by(bag: AgentBag) -> ReceivedFrames:
-    """What the agent of a bag heard."""
-    assert bag.log.heard is not None
-    return bag.log.heard
-
-
 def _groups_apart(processes: Processes, line: TimeLine) -> list[list[str]]:
     """The groups between which frames do not go both ways, by names; empty: it is one group.
 
@@ -224,11 +217,9 @@ def _sent_datagrams(processes: Processes) -> dict[tuple[int, int], SentDatagram]
     """All datagrams that were sent, by slot and sender."""
     sent = {}
     for process, bag in sorted(processes.items()):
-        log, frames = bag.log, bag.log.sent_frames
-        assert log.sent_ns is not None
-        times_ns = log.start_ns[frames.row] + log.sent_ns[frames.row, 0]
-        for row, sent_ns, data in zip(frames.row.tolist(), times_ns.tolist(), frames.data, strict=True):
-            sent[log.first_slot + row, process[0]] = SentDatagram(process, sent_ns, data)
+        rows, _, datagrams, *_ = bag.log.sent_frames
+        for row, sent_ns, data in zip(rows.tolist(), bag.sent_ns.tolist(), datagrams, strict=True):
+            sent[bag.log.first_slot + row, process[0]] = SentDatagram(process, sent_ns, data)
     return sent
 
 
@@ -245,7 +236,7 @@ def _crossings(
     count = unmatched = 0
     rows: list[tuple[int, int, int, int]] = []
     for receiver, bag in processes.items():
-        heard = _heard_by(bag)
+        heard = bag.heard
         columns = heard.slot.tolist(), heard.sender.tolist(), heard.time_ns.tolist(), heard.data
         for slot, sender, arrival_ns, data in zip(*columns, strict=True):
             origin = sent.get((slot, sender))
@@ -266,18 +257,13 @@ class _SlotStarts:
     def __init__(self, processes: Processes, clocks: Mapping[Process, Clock], slot_ns: int) -> None:
         self._slot_ns = slot_ns
         on_line = [(process, clocks[process], bag) for process, bag in processes.items() if process in clocks]
-        rows = [np.flatnonzero(bag.log.known) for _, _, bag in on_line]
-        starts = [
-            (row + bag.log.first_slot, clock.common_ns(bag.log.start_ns[row]))
-            for row, (_, clock, bag) in zip(rows, on_line, strict=True)
-        ]
+        starts = [(bag.slots, clock.common_ns(bag.start_ns)) for _, clock, bag in on_line]
         first = [int(clock.common_ns(bag.started_ns)) for process, clock, bag in on_line if process[1] == 0]
         self._started_ns = max(first, default=None)
         self._slot = np.unique(np.concatenate([np.zeros(0, np.int64), *(slots for slots, _ in starts)]))
         self._zero_ns = min((int(at_ns.min()) for _, at_ns in starts if len(at_ns)), default=0)
-        at = self._at_ns = np.full(
-            (len(self._slot), len(starts)), np.nan
-        )  # from `_zero_ns` on; NaN: it had no such slot
+        # (slots, processes) from `_zero_ns` on; not a number: the process had no such slot
+        at = self._at_ns = np.full((len(self._slot), len(starts)), np.nan)
         for column, (slots, at_ns) in enumerate(starts):
             at[np.searchsorted(self._slot, slots), column] = at_ns - self._zero_ns
         count = np.isfinite(at).sum(axis=1)
@@ -315,10 +301,10 @@ class _SlotStarts:
 
 
 # -- one log ---------------------------------------------------------------------------------------------------------
-def _log_alone(process: Process, bag: AgentBag) -> FlightArrays:
+def _log_alone(process: Process, bag: AgentBag) -> FlightLog:
     """The log of a process that shares no time line with others."""
     nothing: dict[str, Any] = {"missing": [], "broken_off": [], "nothing_written": [], "not_on_the_time_line": []}
-    return _join({process: bag}, {process: lambda own_ns: own_ns}, bag.log.first_slot, 0, nothing)
+    return _join({process: bag}, {process: np.copy}, bag.log.first_slot, 0, nothing)
 
 
 def _join(
@@ -335,8 +321,7 @@ def _join(
     config = next(iter(processes.values())).swarm
     first = min(bag.log.first_slot for bag in processes.values())
     last = max(bag.log.first_slot + len(bag.log) for bag in processes.values()) - 1
-    count = len({slot for bag in processes.values() for slot in np.flatnonzero(bag.log.known) + bag.log.first_slot})
-    if last - first >= 2 * count + 1000 or last > _MAX_SLOT:
+    if last - first >= 2 * len(np.unique(np.concatenate([bag.slots for bag in processes.values()]))) + 1000:
         raise BagError(f"no agent tells of most of the slots {first} to {last}: no flight to record")
     arrays = empty_arrays(last - first + 1, config.agents, config.steps, config.slot_ns)
     arrays["start_ns"] += first * config.slot_ns
@@ -344,27 +329,21 @@ def _join(
     frames: dict[tuple[int, int], tuple[int, bytes]] = {}  # by row and sender: when, and what
     heard: list[ReceivedFrames] = []
     for process, bag in sorted(processes.items()):
-        log, frames_sent, heard_frames = bag.log, bag.log.sent_frames, _heard_by(bag)
-        own, column, to_common = np.flatnonzero(log.known), process[0] - 1, times[process]
-        row = own + log.first_slot - first
-        assert log.sent_ns is not None
-        sent_ns = np.maximum(0, to_common(log.start_ns[own] + log.sent_ns[own, 0]))
-        own_ns = np.where(log.sent[own, 0], sent_ns, to_common(log.start_ns[own]))
-        arrays["known"][row, column] = True
-        arrays["offset_ns"][row, column] = own_ns - arrays["start_ns"][row]
+        log, sent, received = bag.log, bag.log.sent_frames, bag.heard
+        own, column, offset = np.flatnonzero(log.known), process[0] - 1, log.first_slot - first
+        start_ns, sent_ns = times[process](log.start_ns), np.maximum(0, times[process](bag.sent_ns))
+        start_ns[sent.row] = sent_ns
+        arrays["known"][own + offset, column] = True
+        arrays["offset_ns"][own + offset, column] = start_ns[own] - arrays["start_ns"][own + offset]
         for name in (*DECIDED, *VECTORS, "presence", "track"):
-            arrays[name][row, ..., column] = getattr(log, name)[own, ..., 0]
-        offset = log.first_slot - first
-        for at, data in zip(frames_sent.row + offset, frames_sent.data, strict=True):
-            frames[int(at), column + 1] = (
-                int(arrays["offset_ns"][at, column] + arrays["start_ns"][at]),
-                frame_in(data, config),
-            )
-        by = np.zeros((len(heard_frames.row), config.agents), np.bool_)
-        by[:, column] = True
-        data = [frame_in(one, config) for one in heard_frames.data]
-        times_ns = to_common(heard_frames.time_ns)
-        heard.append(heard_frames._replace(row=heard_frames.row + offset, time_ns=times_ns, receivers=by, data=data))
+            arrays[name][own + offset, ..., column] = getattr(log, name)[own, ..., 0]
+        for row, at_ns, data in zip((sent.row + offset).tolist(), sent_ns.tolist(), sent.data, strict=True):
+            frames[row, column + 1] = at_ns, frame_in(data, config)
+        heard.append(ReceivedFrames(
+            received.row + offset, received.sender, received.slot, times[process](received.time_ns),
+            np.repeat(np.arange(config.agents)[None] == column, len(received.row), axis=0), received.before,
+            [frame_in(data, config) for data in received.data],
+        ))  # fmt: skip
     taken = _sorted_by_row(heard)
     columns = taken.slot.tolist(), taken.sender.tolist(), taken.time_ns.tolist(), taken.data
     for slot, sender, arrival_ns, data in zip(*columns, strict=True):  # frames of agents of which there is no record
