@@ -58,36 +58,32 @@ def slots_until_all_known(config: SwarmConfig) -> int:
 class _PairAges:
     """Pairs of two agents that are there: how many knew each other, and the oldest frame heard."""
 
-    def __init__(self, log: FlightArrays, observers: NDArray[np.int64]) -> None:
-        config, self._number = log.config.swarm, np.full(log.agents + 1, -1)  # of each observer, by id
-        self._number[observers] = np.arange(len(observers))
+    def __init__(self, log: FlightArrays) -> None:
+        self._log, config = log, log.config.swarm
         self._slot_ms, self._fresh = config.slot_ms, slots_until_all_known(config)
-        self._newest = np.full((len(observers), log.agents), -1)  # slot of the newest frame that each heard of each
+        self._newest = np.full((log.agents, log.agents), -1)  # slot of the newest frame that each heard of each
         self._pairs = self._known = 0
         self._oldest, self._pair = -1, (0, 0)
-        heard = log.heard
-        entry, column = np.nonzero(heard.receivers) if heard is not None else np.zeros((2, 0), np.int64)
-        row, sender, slot = (heard[k][entry] for k in range(3)) if heard is not None else np.zeros((3, 0), np.int64)
-        used = (self._number[column + 1] >= 0) & (sender > 0) & (sender <= log.agents)
-        self._heard = self._number[column + 1][used], sender[used] - 1, slot[used]
-        self._ends = np.searchsorted(row[used], np.arange(len(log) + 1)).tolist()
 
     def add_received(self, row: int) -> None:
         """Count what agents heard in a slot."""
-        observer, sender, slot = (values[self._ends[row] : self._ends[row + 1]] for values in self._heard)
-        np.maximum.at(self._newest, (observer, sender), slot)
+        heard = self._log.heard
+        for k in range(self._log.heard_ends[row], self._log.heard_ends[row + 1]) if heard is not None else ():
+            if 0 < heard.sender[k] <= self._log.agents:
+                newest = self._newest[:, heard.sender[k] - 1]
+                np.maximum(newest, heard.slot[k], out=newest, where=heard.receivers[k])
 
     def add_slot(self, slot: int, first: int, here: Sequence[int], tables: Swarm) -> None:
         """Count the end of a slot.
 
         :param first: of the slots that count: an agent that was never heard is as old as they are.
         """
-        ids = np.array(here, np.int64)
-        pairs = np.ix_(self._number[ids], ids - 1)
-        others, newest = ids[:, None] != ids, self._newest[pairs]
+        column = np.array(here, np.int64) - 1
+        newest, others = self._newest[np.ix_(column, column)], column[:, None] != column
+        sent = tables.sent_slot[np.ix_(np.searchsorted(tables.observer, column), column)]
         age = np.where(others, slot - np.where(newest < 0, first - 1, newest), -1)
         self._pairs += int(others.sum())
-        self._known += int((tables.sent_slot[pairs] >= max(0, slot - self._fresh))[others].sum())
+        self._known += int((sent >= max(0, slot - self._fresh))[others].sum())
         if age.max(initial=-1) > self._oldest:
             observer, sender = np.unravel_index(age.argmax(), age.shape)
             self._oldest, self._pair = int(age.max()), (here[observer], here[sender])
@@ -191,7 +187,7 @@ class MergedReplay:
         observers = np.unique([process.agent for process in self.processes]).astype(np.int64)
         if not len(observers):
             return
-        metrics, pairs = FlightMetrics(run_of(config), scenario), _PairAges(log, observers)
+        metrics, pairs = FlightMetrics(run_of(config), scenario), _PairAges(log)
         tables = make_swarm(config, scenario, local=[], observers=observers.tolist())
         copied = [
             [(getattr(tables, name)[np.searchsorted(observers, process.agent)], getattr(process.replay.swarm, name)[0])
@@ -201,9 +197,8 @@ class MergedReplay:
         track = np.repeat(scenario.start[None], config.steps, axis=0)
         common = self._log.first_slot - log.first_slot
         begins = common + slots_until_all_known(config)
-        last = min(
-            (process.last - log.first_slot for process in self.processes if process.has_ended), default=len(log) - 1
-        )
+        ends = [process.last - log.first_slot for process in self.processes if process.has_ended]
+        last = min(ends, default=len(log) - 1)
         for agent in set(range(1, log.agents + 1)) - set(observers.tolist()):
             metrics.lose(agent, hovers=False)
         start: int | None = None  # of the results, row
@@ -221,13 +216,16 @@ class MergedReplay:
                     table[:] = own
             pairs.add_received(row)
             counts = begins <= row < last
-            if counts and start is None:
-                counts = not any(_is_new(self.processes[k].replay.swarm) for k in active)
+            if counts and start is None and config.policy_row.probation:
+                counts = not any(self.processes[k].replay.swarm.lease_status(0)["probation"] for k in active)
             if counts:
                 start = row if start is None else start
                 here = _update_track(metrics, observers.tolist(), log.known[row:], log.track[row + 1], track)
                 if len(here) > 1:
-                    metrics.compare_tables(slot, *_beliefs(log, row, here))
+                    # Those that are not there have no say: they count as the first one that is.
+                    say, first = np.isin(np.arange(1, log.agents + 1), here), here[0] - 1
+                    beliefs = (np.where(say, one[row], one[row, first]) for one in (log.digest, log.chosen))
+                    metrics.compare_tables(slot, *beliefs)
                 count = int(log.sent[row].sum())
                 outcome = COLLISION if count > 1 else SUCCESS if count else IDLE
                 metrics.update(slot, track, tables, outcome, [config.frame_length] * count)
@@ -253,11 +251,6 @@ class MergedReplay:
         return [*notes, _NO_RESULTS if self._counted is None else _RESULTS.format(*self._counted)]
 
 
-def _is_new(swarm: Swarm) -> bool:
-    """Whether an agent is on probation: it sends at its anchors only, and hovers."""
-    return swarm.config.policy_row.probation and bool(swarm.lease_status(0)["probation"])
-
-
 def _update_track(
     metrics: FlightMetrics, observers: Sequence[int], known: NDArray[np.bool_], after: Any, track: Any
 ) -> list[int]:
@@ -279,17 +272,6 @@ def _update_track(
         elif agent not in metrics.lost and not known[2:_GAP_SLOTS, column].any():
             metrics.lose(agent, hovers=False)
     return here
-
-
-def _beliefs(log: FlightArrays, row: int, here: Sequence[int]) -> tuple[Any, Any]:
-    """Digests and choices of those that are here; of the others, those of the first one: they have no say."""
-    columns, first = np.array(here) - 1, here[0] - 1
-    found = []
-    for values in (log.digest[row], log.chosen[row]):
-        beliefs = np.full_like(values, values[first])
-        beliefs[columns] = values[columns]
-        found.append(beliefs)
-    return found[0], found[1]
 
 
 def _results(metrics: FlightMetrics, first: int) -> dict[str, Any]:
