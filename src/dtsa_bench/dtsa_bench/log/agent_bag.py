@@ -348,7 +348,7 @@ class _Reader:
     def _add_message(self, record: Message) -> None:
         times = record.log_time, record.publish_time, record.sequence
         self.digest.add(SLOT_RECORD.encode(), *times, record.data, True)
-        message = self._store.deserialize_cdr(record.data, TYPE)
+        message: Any = self._store.deserialize_cdr(record.data, TYPE)
         if len(message.agent) != 1 or len(message.presence) != 1:
             raise ValueError("not of one agent")
         by = pack_received(np.ones((len(message.heard_sender), 1), np.bool_))

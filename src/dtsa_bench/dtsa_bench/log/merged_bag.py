@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,17 +53,9 @@ def open_log(path: str | Path) -> FlightLog:
             if AGENT not in bag.custom_data:
                 return load_log(bag)
         bags = [Path(path)]
-    log = merge_bags(bags)
+    log = Merge(*read_all(bags)).log
     log.name, log.file = Path(path).resolve().stem, Path(path)
     return log
-
-
-def merge_bags(paths: Sequence[str | Path]) -> FlightLog:
-    """The log of a flight of which these are the agents' bags.
-
-    :raises ConfigError: for bags that are not of one flight, or have no common time line.
-    """
-    return Merge(*read_all(paths)).log
 
 
 def write_merged(directory: Path, log: FlightArrays, summary: Mapping[str, Any]) -> Path:
