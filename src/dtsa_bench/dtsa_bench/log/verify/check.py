@@ -21,9 +21,7 @@ from dtsa_bench.runs.config import LOCKSTEP, REALTIME
 from dtsa_bench.runs.delivery import recorded_problem
 
 from .contents import EVENTS, MERGED, BagContents
-from .lockstep import check_lockstep
-from .merged import check_merged
-from .realtime import check_realtime
+from .flights import check_lockstep, check_merged, check_realtime
 from .result import Difference, Mismatch, Result
 
 
