@@ -168,12 +168,6 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
         result.safety |= _clock_spread(log)
 
 
-def _compare(log: FlightArrays, why: str = "", **expected: Any) -> None:
-    """Compare fields of a log; Mismatch: they differ."""
-    if mismatch := first_difference(log, expected, why):
-        raise mismatch
-
-
 def _check_decisions(
     log: FlightArrays, frames: FramesOnAir, result: Result, summary: dict[str, Any], has_key: bool
 ) -> None:
@@ -249,7 +243,7 @@ def _own_states(
         raise RemoteProtocolError("a tag that the key does not make")
     data = config.protocol_part(opened)
     own = decode_extended(data, config.extent_m).own if config.extended else decode_frame(data, config.extent_m)
-    position, velocity, command = (tuple(vector) for vector in state)
+    position, velocity, command = ((x, y, z) for x, y, z in state)
     expected = Frame(agent, slot & _SLOT_MASK, own.c_r, position, velocity, command if own.intent else None)
     return own, decode_frame(encode_frame(expected, config.extent_m), config.extent_m)
 
@@ -266,7 +260,9 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     about = log.merged or {}
     result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
     result.count("slot records", len(log))
-    _check_receptions(log)
+    for part, (received, lost, outcome) in zip(log.parts, receptions_of(log), strict=True):
+        expected = {"outcome": outcome, "lost": lost, "collided": np.zeros_like(lost), "received": received}
+        _compare(part, "it follows from what the agents heard", **expected)
     check_own_states(log, result)
     replay = MergedReplay(log).run()
     if first := next((one for process in replay.processes for one in process.replay.differences), None):
@@ -297,12 +293,7 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     }
 
 
-def _check_receptions(log: FlightArrays) -> None:
-    """Who received a frame, and who did not, follows from what each agent heard.
-
-    :raises Mismatch: at the first difference.
-    """
-    for part, (received, lost, outcome) in zip(log.parts, receptions_of(log), strict=True):
-        expected = {"outcome": outcome, "lost": lost, "collided": np.zeros_like(lost), "received": received}
-        if mismatch := first_difference(part, expected, "it follows from what the agents heard"):
-            raise mismatch
+def _compare(log: FlightArrays, why: str = "", **expected: Any) -> None:
+    """Compare fields of a log; Mismatch: they differ."""
+    if mismatch := first_difference(log, expected, why):
+        raise mismatch

@@ -11,29 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_bench.log.arrays import FlightArrays, ReceivedFrames
-from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
+from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict
 
 from .result import Mismatch
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-
-class _RecordedMedium:
-    """A medium in which frames, in the order of their starts, are received by the agents that a log names."""
-
-    def __init__(self, config: ChannelConfig, sender: Ints, received: Mask) -> None:
-        self.config = config
-        self._next = {agent: iter(received[sender == agent]) for agent in set(sender.tolist())}
-
-    def medium(self, slot: int) -> _RecordedMedium:
-        return self
-
-    def advance(self, slot: int) -> None:
-        pass
-
-    def resolve(self, slot: int, frame: OnAir, others: Any, positions: Any = None) -> Reception:
-        return Reception(next(self._next[frame.sender]), 0, 0)
 
 
 @dataclass(slots=True)
@@ -50,6 +33,7 @@ class FramesOnAir:
     asked_ns: Ints  # (F,) for when each sender handed its frame to its radio
     own_clocks: bool = True  # frames start when their sender's clock says so; otherwise with their slot
     positions: NDArray[np.float64] | None = None  # (S, 3, N) m, at the start of each slot
+    # Without other frames; with those that a radio has to hand over before, from `resolve_again` on.
     end_ns: Ints = field(init=False)  # (F,) of the transmission
     arrival_ns: Ints = field(init=False)  # (F,) when the last of the receivers had it
 
@@ -57,11 +41,6 @@ class FramesOnAir:
         airtime, lengths = self.config.airtime, self.length.tolist()
         self.end_ns = self.asked_ns + np.array([airtime.total_ns(length) for length in lengths], np.int64)
         self.arrival_ns = self.end_ns + np.array([airtime.from_radio_ns(length) for length in lengths], np.int64)
-        if self.own_clocks and airtime.line.serial:  # radios hand over one reception after the other
-            order = np.argsort(self.asked_ns, kind="stable")
-            for verdict in self._resolve(_RecordedMedium(self.config, self.sender[order], self.received[order])):
-                self.end_ns[verdict.frame_id] = verdict.end_ns
-                self.arrival_ns[verdict.frame_id] = verdict.arrival_ns
 
     @classmethod
     def of_log(cls, log: FlightArrays, config: ChannelConfig, own_clocks: bool) -> FramesOnAir:
@@ -86,7 +65,9 @@ class FramesOnAir:
         again = tuple(values.copy() for values in (self.received, self.lost, self.collided))
         verdicts: list[tuple[Any, ...]] = []  # frames, received, lost, collided
         if self.own_clocks:
-            verdicts += [(v.frame_id, v.received, v.lost, v.collided) for v in self._resolve(channel)]
+            for v in self._resolve(channel):
+                verdicts.append((v.frame_id, v.received, v.lost, v.collided))
+                self.end_ns[v.frame_id], self.arrival_ns[v.frame_id] = v.end_ns, v.arrival_ns
         else:
             edges = np.flatnonzero(np.diff(self.slot, prepend=-1, append=-1)).tolist()
             for frames in (slice(*edge) for edge in pairwise(edges)):
@@ -103,9 +84,9 @@ class FramesOnAir:
             target[late] = recorded[late]
         return *again, int((~late).sum())
 
-    def _resolve(self, media: Any) -> list[FrameVerdict[int]]:
+    def _resolve(self, channel: Channel) -> list[FrameVerdict[int]]:
         """The verdicts on all frames on one time line."""
-        air, verdicts = Air[int](media), list[FrameVerdict[int]]()
+        air, verdicts = Air[int](channel), list[FrameVerdict[int]]()
         for k in np.argsort(self.asked_ns, kind="stable").tolist():
             air.begin(k, int(self.sender[k]), int(self.asked_ns[k]), int(self.length[k]))
         while air.pending:
