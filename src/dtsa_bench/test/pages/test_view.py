@@ -18,7 +18,7 @@ pytest.importorskip("aiohttp")
 import aiohttp
 from browser_helpers import serving
 
-from dtsa_agent.core import Swarm, SwarmConfig
+from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.record import load_log
 from dtsa_bench.pages.view.history import (
@@ -33,6 +33,7 @@ from dtsa_bench.pages.view.history import (
     parse_command,
 )
 from dtsa_bench.pages.view.server import ViewServer, _PageStream
+from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim.model.verdict import SUCCESS
 
 
@@ -96,15 +97,15 @@ def test_a_history_and_what_waits_for_a_page_are_limited() -> None:
     first, moments = history.since(0, 100)
     assert len(moments) <= 4
     assert moments[-1].slot == 4
-    swarm = Swarm(SwarmConfig(agents=AGENTS))
-    builder, reason = MomentBuilder(swarm.scenario), np.zeros(AGENTS, np.uint8)
+    run, reason = RunConfig(SwarmConfig(agents=AGENTS)), np.zeros(AGENTS, np.uint8)
+    builder = MomentBuilder(history, run, make_scenario(run.swarm), {})
     for slot in range(5 * MAX_FRAMES // 2):
         builder.add_frames(slot, SUCCESS, (slot % AGENTS + 1,), reason, None)
-    slots = [
-        numbers(json.loads(builder.build(slot, None, swarm.chosen, None).text)["frames"]["slot"], "<u4") for _ in "ab"
-    ]
-    assert slots[0].tolist() == list(range(slot - MAX_FRAMES + 1, slot + 1))
-    assert not len(slots[1])
+    for _ in "ab":
+        builder.append_moment(slot, None, np.zeros(AGENTS, np.uint16), None)
+    frames = [json.loads(moment.text)["frames"]["slot"] for moment in history.since(0, 5)[1]]
+    assert numbers(frames[0], "<u4").tolist() == list(range(slot - MAX_FRAMES + 1, slot + 1))
+    assert not frames[1]
 
 
 async def _statuses(url: str) -> dict[str, int]:
