@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         SwarmConfig,
         plug_in_random,
     )
-    from dtsa_agent.core.plugins.kinds import Table
+    from dtsa_agent.core.plugins.entry_points import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
     from dtsa_bench.drawing.palette import agent_colour
     from dtsa_bench.log.bag.errors import BagError, UnusableBag
