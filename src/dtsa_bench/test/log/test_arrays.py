@@ -19,7 +19,7 @@ FRAMES = st.lists(FRAME, min_size=2, max_size=12, unique_by=lambda frame: frame[
 
 
 def sent_frames(config: ChannelConfig, frames: list[tuple[Any, ...]]) -> FramesOnAir:
-    """Frames of slot 0 and on: sender, start in ns, bytes, the agents that received it, and how many lost it, collided."""
+    """Frames of slot 0 and on: sender, start in ns, bytes, whom it reached, how many lost it, and where it collided."""
     sender, asked_ns, length, received, lost, collided = (list(column) for column in zip(*frames, strict=True))
     numbers = (np.array(column) for column in (range(len(frames)), sender, length))
     return FramesOnAir(config, *numbers, np.array(received, np.bool_), *map(np.array, (lost, collided, asked_ns)))
