@@ -52,12 +52,8 @@ class ConfigError(DtsaError, ValueError):
 def range_text(low: float | None, high: float | None, unit: str = "") -> str:
     """Return a range in words, for ``allowed`` of an error; one of the bounds may be None."""
     first, last = (f"{bound:g}" if isinstance(bound, float) else str(bound) for bound in (low, high))
-    unit_text = f" {unit}" if unit not in ("", "1") else ""
-    if high is None:
-        return f"{first} or more{unit_text}"
-    if low is None:
-        return f"{last} or less{unit_text}"
-    return f"{first} to {last}{unit_text}"
+    text = f"{first} or more" if high is None else f"{last} or less" if low is None else f"{first} to {last}"
+    return text if unit in ("", "1") else f"{text} {unit}"
 
 
 class LocalProtocolError(DtsaError):

@@ -161,14 +161,14 @@ class Swarm:
 
     def _protocol(self, model: Any) -> dict[str, Any]:
         """Return the fields of ``dtsa_config``; what is not named here has the names of the settings."""
-        config, key = self.config, self.scenario.policy_key
+        config = self.config
         lease = fields_of("dtsa_lease_config", config, open_every=config.open_period, share=config.lease_share)
         return fields_of(
             "dtsa_config", config, policy=POLICIES.number(config.policy), estimator=ESTIMATORS.number(config.estimator),
             avoider=model.kind, selection=SELECTIONS.index(config.selection),
             profile=config.profile,
             targets_known=config.targets_known and self.scenario.goals_known,
-            position_step=position_step(config.extent_m), key=policy_key(config.seed) if key is None else key,
+            position_step=position_step(config.extent_m), key=policy_key(config.seed),
             avoid=model.avoider.to_dict(), lease=lease, start=memory(self._start),
             decay=memory(self._decay), decay_len=DECAY_STEPS,
         )  # fmt: skip

@@ -24,7 +24,7 @@ from dtsa_bench.flights.flight import FlightOptions, check_options
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.schemes.knowledge import whittle_index
 from dtsa_bench.simulation.schemes.mixer import FrameSolver
-from dtsa_bench.simulation.schemes.sotdma import Sotdma
+from dtsa_bench.simulation.schemes.tdma import Sotdma
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_bench.simulation.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
@@ -281,7 +281,9 @@ def test_the_token_ring_takes_as_long_as_its_packets_and_survives_losses() -> No
     assert not any(slot.outcome == COLLISION for slot in carried)
     air._swarm.present[7] = 0
     after = [air.slot(slot) for slot in range(1000, 1400)]
-    assert {int(mask.argmax()) for slot in after[200:] for _, _, mask in slot.heard} == {7}  # sent to it again and again
+    assert {int(mask.argmax()) for slot in after[200:] for _, _, mask in slot.heard} == {
+        7
+    }  # sent to it again and again
     assert sum(len(slot.lengths) for slot in after[200:]) == pytest.approx(20, abs=1)  # one agent, every 20 ms
     # Each packet crosses the line to its sender's radio, the air, and the line from the radio of who answers.
     settings = {"agents": 20, "policy": "dtr", "seed": 3, "options": {"dtr.react_ms": 0.0}}

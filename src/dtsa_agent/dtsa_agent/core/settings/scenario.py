@@ -117,7 +117,6 @@ class Scenario:
     moving: NDArray[np.bool_]
     plan: Plan | None = None
     goals_known: bool = True  # all know where everybody wants to be in each slot
-    policy_key: int | None = None  # by which policies draw lots; None: it is made when it is needed
 
     def course(self, local: NDArray[np.int32]) -> Course | None:
         """The state of a flight along the plan, of the agents with indices ``local``; None without a plan."""

@@ -1,12 +1,13 @@
-"""Schemes in which agents contend for a slot, with help that real radios would have to provide."""
+"""Schemes in which agents contend for a slot, by chance, by dominance or by listening: what such radios could gain."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dtsa_agent.core import Swarm, SwarmConfig
+from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 
-from .knowledge import ages, error_about_self, moves
+from .knowledge import ages, error_about_self, moves, squared_errors
 
 #: Of threshold ALOHA: age threshold over n and rate times n that give the least age for many agents.
 THRESHOLD, RATE = 2.2, 4.69
@@ -67,3 +68,95 @@ class Dominance:
         worst = np.flatnonzero(error >= error.max())
         silent = slot - swarm.sent_slot[worst, worst]
         return [int(worst[silent.argmax()]) + 1]
+
+
+class Sense:
+    """The slot's owner first where it has something unexpected to say; else, after guard times, who moves.
+
+    TDMA's owner begins at once if it has set out and not said so yet, and in one of ``sense.rounds`` (15) rounds,
+    another one for each owner. Otherwise each agent that has said that it moves waits for as many guard times as its
+    rank says, and gives up when it senses a frame; who has arrived says so in its next turn. Of those that it takes for
+    movers the one whose last turn is longest ago has rank 1; who lets its turns pass has arrived; ranks above
+    ``sense.ranks`` (4) do not try. Turns are sensed, also where the frame is lost: the guard times say whose it was.
+    Where tables differ in who moves, two may have the same rank, and collide. No turn is given away, so nobody needs to
+    hear of it, and who wakes waits N slots at most. All sense each other. A guard time is the turn-round of a radio and
+    the time in which it senses, for which slots have to leave room.
+    """
+
+    options = ("rounds", "ranks")
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del agent
+        self._rounds = max(1, round(config.options.get("sense.rounds", 15.0)))
+        self._ranks = config.options.get("sense.ranks", 4.0)
+        self._turn = np.full(config.agents, -1, dtype=np.int64)  # slot of each one's last turn, as all have sensed it
+
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
+        """The owner's id, or those of the lowest rank: several collide."""
+        chosen = self._chosen(swarm, slot)
+        self._turn[chosen] = slot
+        return [int(k) + 1 for k in chosen]
+
+    def _chosen(self, swarm: Swarm, slot: int) -> NDArray[np.int64]:
+        """Indices of those that send."""
+        n = np.arange(swarm.config.agents)
+        owner = slot % len(n)
+        there, said = swarm.present > 0, swarm.in_ap[n, n] > 0
+        due = self._turn[owner] < 0 or (slot // len(n) + owner) % self._rounds == 0
+        if there[owner] and (due or (moves(swarm)[owner] and not said[owner])):
+            return n[owner : owner + 1]
+        contend = np.flatnonzero(said & there)
+        if not contend.size:
+            return contend
+        order = self._turn * len(n) + n
+        rivals = swarm.in_ap[contend] > 0
+        silent = slot - self._turn[None, :] > 2 * rivals.sum(axis=1)[:, None] + 4  # has arrived: its turns came
+        rank = (rivals & ~silent & (order < order[contend][:, None])).sum(axis=1) + 1
+        first = int(rank.min())
+        return contend[rank == first] if first <= self._ranks else contend[:0]
+
+
+class ThresholdAoii:
+    """Threshold policy on the age of incorrect information (AoII): from some age on an agent sends at random.
+
+    The AoII of an agent is for how many slots in a row somebody has been wrong about it: by more than a distance, or
+    about whether it is under way. From ``threshold`` slots on it sends with a probability, below it is silent. The
+    setting is that of arXiv 2301.10987: slotted ALOHA, collisions, and every agent knows its own AoII, as perfect
+    acknowledgements would tell it. There one gateway receives; here the receiver counts that has been wrong longest.
+    That source starts from this policy and then refines it by a dual method, which is not here.
+
+    Options: ``threshold-aoii.error_m`` (0.05), ``threshold-aoii.threshold`` (1 slot) and ``threshold-aoii.rate`` (1.0:
+    the probability is rate / n, at most 1, with n agents under way). These values are assumptions.
+
+    :raises ConfigError: for a negative distance, or a rate or a threshold that would let nobody send.
+    """
+
+    options = ("error_m", "rate", "threshold")
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del agent
+        self._error = config.options.get("threshold-aoii.error_m", 0.05)
+        self._threshold = config.options.get("threshold-aoii.threshold", 1.0)
+        self._rate = config.options.get("threshold-aoii.rate", 1.0)
+        for name, value, low in (("error_m", self._error, 0.0), ("threshold", self._threshold, 1.0)):
+            if not value >= low:
+                raise ConfigError(f"threshold-aoii.{name}", value, f"at least {low:g}")
+        if not self._rate > 0.0:
+            raise ConfigError("threshold-aoii.rate", self._rate, "above 0")
+        self._random = np.random.default_rng([config.seed, 2301])
+        #: (N,) slots for which somebody has been wrong about each agent.
+        self.age = np.zeros(config.agents, dtype=np.int64)
+
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
+        """Ids of all whose draw says so; several collide. While nobody is under way, the slot's owner under TDMA."""
+        draws = self._random.random(swarm.config.agents)
+        under_way, there = moves(swarm), swarm.present > 0
+        wrong = (squared_errors(swarm, slot) > self._error**2) | ((swarm.in_ap > 0) != under_way[None, :])
+        wrong &= there[:, None] & there[None, :]
+        np.fill_diagonal(wrong, False)
+        self.age = np.where(wrong.any(axis=0), self.age + 1, 0)
+        n = int(np.count_nonzero(under_way))
+        if not n and not wrong.any():
+            return [slot % swarm.config.agents + 1]
+        ready = (self.age >= self._threshold) & (draws < self._rate / max(1, n))
+        return [int(k) + 1 for k in np.flatnonzero(ready)]

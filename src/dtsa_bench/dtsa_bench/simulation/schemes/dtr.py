@@ -61,11 +61,8 @@ class Dtr:
             self._state, self._packet = _IDLE, None
         if self._packet is not None and now_ns >= self._due_ns:
             kind, target = self._packet
-            sent = (
-                radio.send(self._note(kind, target), target)
-                if kind == _DATA
-                else radio.send_note(self._note(kind, target))
-            )
+            note = self._note(kind, target)
+            sent = radio.send(note, target) if kind == _DATA else radio.send_note(note)
             self._due_ns = now_ns + (self._resend_ns if sent else _RETRY_NS)
             if sent and self._state == _IDLE:
                 self._packet = None  # CTS and acknowledgements are sent once

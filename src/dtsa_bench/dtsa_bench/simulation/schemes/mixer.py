@@ -23,11 +23,7 @@ class FrameSolver:
         self.rows: dict[int, tuple[int, int]] = {}  # by the highest bit of the vector: vector, sum of the frames
 
     def add(self, vector: int, mixed: int) -> None:
-        """Takes in a combination; one that says nothing new is dropped.
-
-        :param vector: bit k - 1: the frame of agent k is in it.
-        :param mixed: sum of these frames, modulo 2.
-        """
+        """Add the sum of some frames, modulo 2; bit k - 1 of ``vector``: that of agent k is in it."""
         while vector:
             first = vector.bit_length() - 1
             row = self.rows.get(first)
