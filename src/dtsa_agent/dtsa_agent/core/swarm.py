@@ -14,7 +14,7 @@ from .authentication import Authenticator
 from .errors import ConfigError
 from .frame import FRAME_MAX, position_step
 from .kernel import ffi, fields_of, lib, memory
-from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
+from .registry import ESTIMATORS, POLICIES, SELECTIONS
 from .settings.config import SwarmConfig
 from .settings.flight_models import flight_model
 from .settings.scenario import Course, Scenario, check_extent, make_scenario, policy_key
@@ -68,6 +68,7 @@ class Swarm:
     """
 
     all_in_c = True  # no step is overridden
+    flies_in_c = True  # nor are estimates and commands
 
     # What C borrows, by the names in ``swarm`` (libdtsa_sim/swarm.h). Letters of shapes: n agents, v tables, l local
     # agents, s control instants, f bytes of a frame, p bytes of a policy's state.
@@ -136,7 +137,6 @@ class Swarm:
         self._share_arrays(kernel, sizes)
         self.local[:], self.observer[:], self.final[:] = np.array(self.ids) - 1, np.array(tables) - 1, 1
         self.known_goal[:] = self.scenario.target
-        self.rows = np.arange(count)  # (L,) table of each local agent, unless shared
         self.course: Course | None = self.scenario.course(self.local)  # where they are in the scenario's plan
         self.kernel = ffi.gc(kernel, lib.swarm_close)
         fault = lib.swarm_open(self.kernel)
@@ -196,6 +196,9 @@ class Swarm:
 
     def begin(self, slot: int) -> tuple[int, ...]:
         """Decide who sends in a slot, and encode the frames; returns the positions in ``ids`` of those that send."""
+        if not self.all_in_c:
+            self.decide(slot)
+            return self.emit(slot)
         self._slot = slot
         count = lib.swarm_begin(self.kernel, slot)
         return (self._senders[0],) if count == 1 else tuple(self._senders[:count])
@@ -233,7 +236,12 @@ class Swarm:
 
     def fly(self, slot: int) -> None:
         """Commands and motion of the local agents during a slot, :meth:`steer` and :meth:`move` at each instant."""
-        lib.swarm_fly(self.kernel, slot, 0)
+        if self.flies_in_c:
+            lib.swarm_fly(self.kernel, slot, 0)
+            return
+        for step in range(self.config.steps):
+            self.steer(slot, step)
+            self.move(step)
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         """Fill ``command`` for one control instant, 0 .. steps; ``estimate``: whether to fill the estimates first."""
@@ -339,10 +347,6 @@ class Swarm:
         if not 0 <= local_index < len(self.ids):
             raise ValueError(f"local index: got {local_index}")
         return int(local_index)
-
-    def reason_name(self, local_index: int) -> str:
-        """Why the agent decided as it did in this slot, one of ``REASONS``."""
-        return REASONS[int(self.reason[local_index])]
 
     @property
     def rejected(self) -> int:

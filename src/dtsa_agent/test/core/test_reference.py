@@ -174,7 +174,7 @@ def test_who_is_most_urgent_is_found_without_all_priorities(count: int, seed: in
     swarm.sent_position[:], swarm.sent_velocity[:], swarm.in_ap[:], swarm.last_turn[:] = position, velocity, in_ap, last
     swarm.decide(8)  # nobody was heard: states are as they are
     plain = policies.select(g, (7 - last).tolist(), in_ap.tolist(), epsilon)
-    assert (int(swarm.chosen[0]) - 1, swarm.reason_name(0), swarm.score[0]) == (plain.index, plain.reason, plain.g)
+    assert (int(swarm.chosen[0]) - 1, REASONS[swarm.reason[0]], swarm.score[0]) == (plain.index, plain.reason, plain.g)
     known = ~np.isnan(swarm.priority[0]) & in_ap.any()
     assert swarm.priority[0][known].tobytes() == np.array(g)[known].tobytes()
 

@@ -37,7 +37,6 @@ The first Ctrl-C lands all, the second stops all motors."""
         ("--places 10 > swarm.yaml", "a file to begin with: where ten begin, and rates for one dongle"),
         ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
     )
-
     options = (
         ("--config CONFIG", "swarm.yaml: robots, types, defaults, station", {"type": Path}),
         ("--places N", "print a swarm.yaml for a mission of N on one dongle: places and rates; and end"),
@@ -182,6 +181,7 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
     def run(self, args: argparse.Namespace) -> int:
         """Fly and print what came of it."""
         from dtsa_agent.core.errors import ConfigError
+        from dtsa_agent.core.settings.declaration import parse_values
         from dtsa_bench.crazyflies.peer_lab.app import LabSettings
         from dtsa_bench.crazyflies.peer_lab.process import fly
         from dtsa_bench.runs.options import given_options, new_directory
@@ -189,7 +189,10 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
         if not 0.0 < args.seconds <= 1e6:
             raise ConfigError("seconds", args.seconds, "more than 0, up to 1000000")
         settings = LabSettings(**given_options(args, LabSettings, "lab"))
-        parameters = dict(map(_parameter, args.set))
+        try:
+            parameters = parse_values(",".join(args.set))
+        except ValueError:
+            raise ConfigError("set", ", ".join(args.set), "GROUP.NAME=NUMBER") from None
         out = None if args.out is None else new_directory(args.out)
         swarm, place = None, args.app
         of_protocol = {name: getattr(args, name) for name in _OF_PROTOCOL if getattr(args, name) is not None}
@@ -229,16 +232,6 @@ def _swarm(options: dict[str, str], settings: Any) -> SwarmConfig:
     check_onboard_swarm(swarm)
     key_of(swarm)
     return swarm
-
-
-def _parameter(text: str) -> tuple[str, float]:
-    from dtsa_agent.core.errors import ConfigError
-
-    name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise ConfigError("set", text, "GROUP.NAME=NUMBER") from None
 
 
 def _lines(summary: dict[str, Any], printed: int) -> str:

@@ -184,11 +184,9 @@ def run_crazyflies(args: argparse.Namespace) -> int:
 
 def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
     """What went wrong in a mission; empty: nothing. ``cut_short``: why the exchange was, if it was."""
-    if not (cut_short or not_landed):
-        return ""
     exchange = f"the exchange was cut short: {cut_short}" if cut_short else "the exchange is complete"
     end = f"not known to have landed: {', '.join(not_landed)}" if not_landed else "all have landed"
-    return f"{exchange}; {end}"
+    return f"{exchange}; {end}" if cut_short or not_landed else ""
 
 
 def _report_missing_frames(summary: dict[str, Any]) -> bool:
@@ -200,11 +198,8 @@ def _report_missing_frames(summary: dict[str, Any]) -> bool:
 
 def _print_result(args: argparse.Namespace, flight: Any) -> None:
     """Print what came of a flight."""
-    if args.json:
-        print(json.dumps(flight.summary, indent=2))
-        return
-    print(describe(flight.summary))
-    print(f"bag:     {flight.bag}\nresults: {Path(args.out) / 'summary.json'}")
+    files = f"bag:     {flight.bag}\nresults: {Path(args.out) / 'summary.json'}"
+    print(json.dumps(flight.summary, indent=2) if args.json else f"{describe(flight.summary)}\n{files}")
 
 
 def describe(summary: dict[str, Any]) -> str:

@@ -187,7 +187,6 @@ class RelayCommand(Command):
 Topics of any robots over the shared channel: /robot1/pose comes out as /robot2/from/robot1/pose, late, or not at all.
 A YAML file names robots, topics, places and the channel. Ctrl-C ends it."""
     examples = (("examples/relay.yaml", "two talkers that lose every fifth message"),)
-
     options = (
         ("file", "YAML file: robots, topics, channel", {"type": Path}),
         ("--use-sim-time", "time is that of /clock"),

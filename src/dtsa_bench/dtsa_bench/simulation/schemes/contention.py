@@ -14,13 +14,11 @@ THRESHOLD, RATE = 2.2, 4.69
 
 
 class ThresholdAloha:
-    """Threshold ALOHA: silent while one's own age is below 2.2 n, then sends with probability 4.69 / n.
+    """Threshold ALOHA: silent while its own age is below 2.2 n, then it sends with probability 4.69 / n; n agents move.
 
-    n is the number of agents under way. Sources: arXiv 2007.09197 and 2105.05129, where n sources send to one receiver
-    that acknowledges; the mean age tends to 1.4169 n. Here all receive: an agent's age is that at the receiver that
-    knows least, and acknowledgements are perfect and cost no air. It begins with ages that are spread at random: if all
-    begin to contend together, collisions keep up that state for long. Options: ``threshold-aloha.threshold`` and
-    ``threshold-aloha.rate``.
+    arXiv 2007.09197 and 2105.05129 have one receiver that acknowledges. Here an agent's age is that at the receiver
+    that knows least, and acknowledgements are perfect. Ages are spread at random at first: agents that all begin to
+    contend at once do so for long. Options: ``threshold-aloha.threshold`` and ``threshold-aloha.rate``.
     """
 
     options = ("threshold", "rate")
@@ -48,12 +46,10 @@ class ThresholdAloha:
 
 
 class Dominance:
-    """Contention by dominance: who is furthest from where the others must suppose it sends (CAN, WiDom).
+    """Contention by dominance: the agent farthest from where its last frame, moved on, puts it (CAN, WiDom).
 
-    Each agent knows what it last sent, so it can tell how wrong those are who heard that. In a real slot these errors
-    are compared bit by bit before the frame: a sent bit dominates over silence, who hears one it did not send gives up.
-    That costs one turn-round of the radio a bit, 8 to 12 times 0.13 ms, for which slots have to leave room. Lost frames
-    are not noticed.
+    In a real slot these errors are compared bit by bit before the frame, where a sent bit dominates over silence: 8 to
+    12 turn-rounds of the radio, 0.13 ms each, for which slots have to leave room. Lost frames are not noticed.
     """
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
@@ -71,16 +67,12 @@ class Dominance:
 
 
 class Sense:
-    """The slot's owner first where it has something unexpected to say; else, after guard times, who moves.
+    """Radios that listen inside a slot: its owner first where it has something unexpected to send, else movers by rank.
 
-    TDMA's owner begins at once if it has set out and not said so yet, and in one of ``sense.rounds`` (15) rounds,
-    another one for each owner. Otherwise each agent that has said that it moves waits for as many guard times as its
-    rank says, and gives up when it senses a frame; who has arrived says so in its next turn. Of those that it takes for
-    movers the one whose last turn is longest ago has rank 1; who lets its turns pass has arrived; ranks above
-    ``sense.ranks`` (4) do not try. Turns are sensed, also where the frame is lost: the guard times say whose it was.
-    Where tables differ in who moves, two may have the same rank, and collide. No turn is given away, so nobody needs to
-    hear of it, and who wakes waits N slots at most. All sense each other. A guard time is the turn-round of a radio and
-    the time in which it senses, for which slots have to leave room.
+    The owner begins at once if it has set out and not announced that, and in one of ``sense.rounds`` (15) rounds. Else
+    each mover waits for as many guard times as its rank, and gives up when it senses a frame. Rank 1 has the mover
+    whose last turn is longest ago; ranks above ``sense.ranks`` (4) do not try. Turns are sensed, also where the frame
+    is lost. Where tables differ in who moves, two may have the same rank, and collide. All sense each other.
     """
 
     options = ("rounds", "ranks")
@@ -117,18 +109,11 @@ class Sense:
 
 
 class ThresholdAoii:
-    """Threshold policy on the age of incorrect information (AoII): from some age on an agent sends at random.
+    """Slotted ALOHA by the age of incorrect information (AoII), for how many slots in a row some agent has been wrong.
 
-    The AoII of an agent is for how many slots in a row somebody has been wrong about it: by more than a distance, or
-    about whether it is under way. From ``threshold`` slots on it sends with a probability, below it is silent. The
-    setting is that of arXiv 2301.10987: slotted ALOHA, collisions, and every agent knows its own AoII, as perfect
-    acknowledgements would tell it. There one gateway receives; here the receiver counts that has been wrong longest.
-    That source starts from this policy and then refines it by a dual method, which is not here.
-
-    Options: ``threshold-aoii.error_m`` (0.05), ``threshold-aoii.threshold`` (1 slot) and ``threshold-aoii.rate`` (1.0:
-    the probability is rate / n, at most 1, with n agents under way). These values are assumptions.
-
-    :raises ConfigError: for a negative distance, or a rate or a threshold that would let nobody send.
+    Wrong: by more than ``threshold-aoii.error_m`` (0.05), or about whether the agent is under way. From
+    ``threshold-aoii.threshold`` (1 slot) on it sends with probability ``threshold-aoii.rate`` (1.0) / n, n agents under
+    way. arXiv 2301.10987 has one gateway and refines this policy by a dual method; every agent knows its own AoII.
     """
 
     options = ("error_m", "rate", "threshold")

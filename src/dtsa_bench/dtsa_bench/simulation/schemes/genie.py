@@ -19,8 +19,7 @@ def heaviest(weight: NDArray[np.float64], slot: int) -> list[int]:
 class GenieAge:
     """The agent with the largest sum of true ages at all receivers, over pairs that count as movers.
 
-    Greedy. For one base station and equal links greedy is optimal (Kadota and others, arXiv 1801.01803); here, where
-    all send to all, it is a reference and no proven optimum (compared for three agents in docs/evidence/league.md).
+    For one base station and equal links greedy is optimal (Kadota and others, arXiv 1801.01803); here it is no optimum.
     """
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
@@ -53,12 +52,9 @@ class GenieInnovation:
 
 
 class Whittle:
-    """The agent with the largest sum of Whittle's indices of the true ages at all receivers.
+    """The agent with the largest sum of Whittle's indices of the true ages at all receivers, each that of one link.
 
-    The index is that of one link; a frame that reaches several receivers counts the sum of theirs. Option:
-    ``whittle.loss`` (0): the probability that a receiver loses a frame, which has to be known.
-
-    :raises ConfigError: for a probability that is none.
+    Option: ``whittle.loss`` (0): the probability that a receiver loses a frame, which has to be known.
     """
 
     options = ("loss",)

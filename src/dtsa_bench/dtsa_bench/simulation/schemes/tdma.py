@@ -21,16 +21,11 @@ class Sotdma:
     """Each frame announces when its sender comes next and for how long it will keep that rhythm (ITU-R M.1371).
 
     Time has frames of L slots, one report of each agent in each. An agent listens to one frame, then enters with a slot
-    drawn from those it has not heard taken, near its nominal one. It keeps the slot for 3 to 7 frames; the last report
-    in it announces another one, drawn within 0.2 L around it from at least four that are free. Three own bytes: reports
-    left, and offset to the next one. Collisions are not noticed; they end with the slot's time-out.
+    drawn from free ones near its nominal one, and keeps it for 3 to 7 frames; the last report announces another one,
+    within 0.2 L. Three own bytes: reports left, and offset to the next one. Collisions end with the slot's time-out.
 
-    Options: ``sotdma.load`` (0.5), N / L: with more, less is free to choose from; with less, reports are rare.
-    ``sotdma.entry`` (0), 1: the first report has no slot of its own near the nominal one. It begins at a random slot of
-    the second frame, by random access (RATDMA): in each of four free slots it is sent with a probability that grows:
-    1/4, 1/2, 3/4, 1. Slots that others have announced meanwhile are not free. It announces the slot of the next report,
-    as in the network entry of the source. A summary of that was read and not the text; how the probability grows is
-    assumed.
+    Options: ``sotdma.load`` (0.5), N / L. ``sotdma.entry`` (0), 1: the first report is sent by random access (RATDMA)
+    in one of four free slots from a random one of the second frame on, with probability 1/4, 1/2, 3/4, 1 (assumed).
     ``sotdma.reuse`` (0), 1: an agent that finds no free slot near the nominal one takes that of the agent farthest away
     instead of looking farther afield, as STDMA of vehicles does.
     """
@@ -124,8 +119,8 @@ class Sotdma:
 class EventTdma:
     """TDMA in which the owner is silent while its last frame, moved on, is right to within some distance.
 
-    It saves air, not time: nobody else uses the turn. After the idea of the wireless control bus, arXiv 2101.10961.
-    Options: ``event-tdma.error_m`` (0.05) and ``event-tdma.rounds`` (10: the longest silence).
+    After the wireless control bus, arXiv 2101.10961. Options: ``event-tdma.error_m`` (0.05), ``event-tdma.rounds`` (10:
+    the longest silence).
     """
 
     options = ("error_m", "rounds")
