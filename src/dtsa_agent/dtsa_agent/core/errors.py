@@ -69,15 +69,6 @@ class PluginError(DtsaError):
     def __init__(self, part: str, fault: str) -> None:
         super().__init__(f"{part}: {fault}")
 
-    @classmethod
-    def from_exception(cls, part: str, error: BaseException) -> PluginError:
-        """Wrap an exception that a plug-in raised; names file and line."""
-        trace = error.__traceback__
-        while trace is not None and trace.tb_next is not None:
-            trace = trace.tb_next
-        place = f" ({trace.tb_frame.f_code.co_filename}:{trace.tb_lineno})" if trace else ""
-        return cls(part, f"{type(error).__name__}: {error}{place}")
-
     def __reduce__(self) -> tuple[type[PluginError], tuple[str, str]]:
         part, _, fault = str(self).partition(": ")
         return (PluginError, (part, fault))

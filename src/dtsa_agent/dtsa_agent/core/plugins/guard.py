@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import traceback
 from collections.abc import Callable
 from typing import Any, NoReturn
 
@@ -106,6 +107,8 @@ def _guarded(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         except DtsaError:
             raise
         except (Exception, SystemExit, GeneratorExit) as error:  # a plug-in does not end the program
-            raise PluginError.from_exception(part, error) from error
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{frame.filename}:{frame.lineno}"
+            raise PluginError(part, f"{type(error).__name__}: {error} ({place})") from error
 
     return call
