@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import IntEnum
 from functools import lru_cache
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .authentication import Authenticator
 from .errors import ConfigError
 from .frame import FRAME_MAX, position_step
-from .kernel import ffi, fields_of, lib, memory
+from .kernel import ffi, fields_of, lib, memory, shared_arrays
 from .registry import ESTIMATORS, POLICIES, SELECTIONS
 from .settings.config import SwarmConfig
 from .settings.flight_models import flight_model
@@ -176,9 +176,8 @@ class Swarm:
     def _share_arrays(self, kernel: Any, sizes: dict[str, int]) -> None:
         """Make the arrays and lend them to C."""
         self._borrowed = []
-        for name, letters in _SHAPES.items():
-            shape = tuple(sizes[letter] if letter in sizes else int(letter) for letter in letters)
-            array = np.zeros(shape, _ITEMS[name])
+        for name, (letters, item) in _ARRAYS.items():
+            array = np.zeros(tuple(sizes[letter] if letter in sizes else int(letter) for letter in letters), item)
             self._borrowed.append(memory(array, writable=True))
             setattr(self, name, array)
             setattr(kernel, name, self._borrowed[-1])
@@ -324,7 +323,7 @@ class Swarm:
         swarm = Swarm(self.config, self.scenario, local=self.ids)
         swarm.sends[:] = self.sends
         swarm.emit(slot)  # lists the senders of the present slot; what this encodes is written over below
-        for name in _SHAPES.keys() - {"observer"}:
+        for name in _ARRAYS.keys() - {"observer"}:
             getattr(swarm, name)[...] = getattr(self, name)  # the one table becomes everybody's
         swarm.course, swarm.authenticator = self.course, self.authenticator
         return swarm
@@ -364,9 +363,4 @@ class Swarm:
         return int(self.rejects[1])
 
 
-_SHAPES = {
-    name: hint.__metadata__[0]
-    for name, hint in get_type_hints(Swarm, include_extras=True).items()
-    if hasattr(hint, "__metadata__")
-}
-_ITEMS = {name: kind.type.item.cname.removesuffix("_t") for name, kind in ffi.typeof("swarm").fields if name in _SHAPES}
+_ARRAYS = shared_arrays(Swarm, "swarm")
