@@ -204,6 +204,29 @@ def test_places_by_transforms() -> None:
     assert tree.place_of("odom") == pytest.approx([10.0, 0.0, 0.0])
 
 
+def test_transforms_say_who_is_in_range(graph: Graph, tmp_path: Path) -> None:
+    """A robot in a frame that stands still in the map, another one in a frame that moves."""
+    message_type = pytest.importorskip("tf2_msgs.msg", reason="the wheels lack it").TFMessage
+    robots = {"robot1": {**TWO["robot1"], "tf": "robot1/base_link"}, "robot2": {"tf": "robot2/base_link"}}
+    pair = Pair(graph)
+    relay(graph, tmp_path / "relay.yaml", {"range_m": 10}, robots)
+    static = graph.node.create_publisher(message_type, "/tf_static", LATCHED)
+    static.publish(
+        message_type(transforms=[transform("map", "hall", 100.0), transform("hall", "robot1/base_link", 1.0)])
+    )
+    moving = graph.node.create_publisher(message_type, "/tf", 100)
+    pair.connect()
+
+    def move(x: float) -> None:
+        moving.publish(message_type(transforms=[transform("map", "robot2/odom", 98.0)]))
+        moving.publish(message_type(transforms=[transform("robot2/odom", "robot2/base_link", x)]))
+        pair.send(0, 1)
+
+    graph.until(lambda: int(pair.counts().get("out_of_range", 0)) > 0, lambda: move(50.0))
+    assert not pair.texts
+    graph.until(lambda: pair.texts, lambda: move(0.0))
+
+
 def test_time_is_that_of_the_clock_topic(graph: Graph, tmp_path: Path) -> None:
     """Slots of one simulated second: nothing goes before the clock does, whatever the wall says."""
     clock = graph.node.create_publisher(Clock, "/clock", 10)

@@ -132,9 +132,11 @@ class Relay:
     # Where robots are.
 
     def _follow(self, type_name: str, topic: str, accept: Callable[[Any], None]) -> None:
-        qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        if topic == "/tf_static":
+        qos = QoSProfile(depth=_DEPTH)
+        if topic == "/tf_static":  # of a publisher that may have spoken before
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        elif topic != "/tf":
+            qos.reliability = ReliabilityPolicy.BEST_EFFORT
         self._feeds.append((Feed(self._node, message_class(type_name), topic, qos, intake=self._intake), accept))
 
     def _accept_odometry(self, row: int, message: Any) -> None:
