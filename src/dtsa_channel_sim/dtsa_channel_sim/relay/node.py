@@ -219,10 +219,10 @@ class Relay:
         ]
         for sender, receiver in np.argwhere(counts["sent"]).tolist():
             values = {name: counts[name][sender, receiver] for name in COUNTS}
-            newest_ns = self._transport.newest_ns[receiver, sender]
+            newest = self._transport.newest[receiver, sender]
             delay_ms = counts["delay_ns"][sender, receiver] / max(1, values["received"]) / 1e6
             values["delay_mean_ms"] = f"{delay_ms:.3f}"
-            values["age_ms"] = f"{(self._now_ns - newest_ns) / 1e6:.3f}" if newest_ns >= 0 else "-1"
+            values["age_ms"] = f"{(self._now_ns - newest.at_ns) / 1e6:.3f}" if newest else "-1"
             name = f"relay: {self._names[sender]} to {self._names[receiver]}"
             rows.append((name, f"{values['received']} of {values['sent']} received", values))
         message = DiagnosticArray()
