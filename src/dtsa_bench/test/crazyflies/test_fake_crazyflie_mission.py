@@ -121,7 +121,7 @@ def test_two_as_near_as_in_a_crash_or_somebody_who_may_still_fly_fail_a_mission(
     run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
     metrics, ended = FlightMetrics(run, make_scenario(swarm)), StopToken(Stop())
     mission: Any = SimpleNamespace(ended=ended, check_bridge_process=lambda: None)
-    watch, status = MissionWatch(mission, MagicMock(), metrics), ChannelStatus(0, {}, [])
+    watch, status = MissionWatch(mission, MagicMock(), metrics), ChannelStatus(0, [])
     watch.idle(status)
     assert not ended.reason
     metrics.update(0, np.array([[[0.0, 0.19, 2.0], [0.0] * 3, [0.0] * 3]]), None, 0)
