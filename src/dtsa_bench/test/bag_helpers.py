@@ -20,7 +20,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from dtsa_agent.core import REASONS, Swarm, SwarmConfig
+from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_bench.flights.domain import ros_domain
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.cdr import MarkerPacker, OdometryPacker
@@ -61,33 +61,19 @@ def stamp(time_ns: int) -> Any:
     return typestore().types["builtin_interfaces/msg/Time"](time_ns // SECOND, time_ns % SECOND)
 
 
-def header(time_ns: int) -> Any:
-    return typestore().types["std_msgs/msg/Header"](stamp(time_ns), "map")
-
-
 class SyntheticRun:
-    """A flight of the real core on a seeded channel that loses frames, recorded slot by slot.
+    """A flight of the real core on a seeded channel that loses frames, recorded slot by slot; options: `BagWriter`."""
 
-    :param whole: record messages of the graph and markers, too, as another recorder might.
-    :param options: of `BagWriter`.
-    """
-
-    def __init__(
-        self, directory: Path, config: SwarmConfig, loss: float = 0.0, whole: bool = True, **options: Any
-    ) -> None:
+    def __init__(self, directory: Path, config: SwarmConfig, loss: float = 0.0, **options: Any) -> None:
         self.config, self.loss, self._swarm = config, loss, Swarm(config)
         self._ids = np.arange(1, config.agents + 1, dtype=np.uint16)
         self._random, self._start = np.random.default_rng(config.seed), self._swarm.position.copy()
         self._next = 0
-        self._delivery: dict[str, Any] = dict.fromkeys(("sender", "length", "data", "received"), np.zeros(0, np.uint8))
         options["custom_data"] = {FORMAT_KEY: FORMAT} | options.get("custom_data", {})
         self.writer = BagWriter(directory, RunConfig(config).to_dict(), **options)
         self.written: dict[str, list[tuple[int, int, bytes]]] = {}
         self._channels: dict[str, int] = {}
-        swarm_topics = ("Slot", "Transmission", "Reception", "Decision") if whole else ()
-        topics = [(SLOT_RECORD, TYPE, "reliable")]
-        topics += [(f"/swarm/{name.lower()}", f"dtsa_msgs/msg/{name}", "reliable") for name in swarm_topics]
-        topics += [("/swarm/markers", "visualization_msgs/msg/MarkerArray", "reliable")] * whole
+        topics = [(SLOT_RECORD, TYPE, "reliable"), ("/swarm/markers", "visualization_msgs/msg/MarkerArray", "reliable")]
         topics += [(f"/cf{i}/odom", "nav_msgs/msg/Odometry", "sensor_data") for i in self._ids]
         for topic, kind, qos in topics:
             self._channels[topic] = self.writer.add_topic(topic, kind, qos, definition(kind))
@@ -95,30 +81,9 @@ class SyntheticRun:
         self._odometry = OdometryPacker([f"cf{i}/base_link" for i in self._ids])
         self._markers = MarkerPacker(self._ids.tolist())
 
-    def _write(self, topic: str, log_ns: int, publish_ns: int, packed: bytes = b"", **fields: Any) -> None:
-        if topic not in self._channels:
-            return
-        kind = f"dtsa_msgs/msg/{topic.rpartition('/')[2].capitalize()}"
-        message = packed or cdr(kind, header=header(publish_ns), run=RUN, **fields)
+    def _write(self, topic: str, log_ns: int, publish_ns: int, message: bytes) -> None:
         self.writer.write(self._channels[topic], message, log_ns, publish_ns)
         self.written[topic].append((log_ns, publish_ns, message))
-
-    def answer(self, slot: int, data: np.ndarray) -> None:
-        """Record what the agents say at the start of a slot."""
-        swarm, start = self._swarm, SECOND + slot * self.config.slot_ns
-        lengths = [len(swarm.frame(k)) if len(data) else 0 for k in range(self.config.agents)]
-        track = swarm.track.copy() if slot else np.repeat(self._start[None], self.config.steps, 0)
-        self._begin = {
-            "agent": self._ids, "track": track, "velocity": swarm.velocity.copy(), "command": swarm.command.copy(),
-            "goal": swarm.goal.copy(),
-            **{name: getattr(swarm, name).copy() for name in ("chosen", "reason", "digest", "score")},
-        }  # fmt: skip
-        self._write(
-            "/swarm/transmission", start, start, slot=slot, agent=self._ids, length=np.array(lengths, np.uint8),
-            data=data, offset_ns=np.zeros(0, np.int64), chosen=swarm.chosen, reason=swarm.reason, digest=swarm.digest,
-            score=swarm.score, steps=self.config.steps, track=track.ravel(), velocity=swarm.velocity.ravel(),
-            command=swarm.command.ravel(), goal=swarm.goal.ravel() if slot == 0 else np.zeros(0),
-        )  # fmt: skip
 
     def end(self, slot: int) -> None:
         """Record where all are at the end."""
@@ -131,49 +96,31 @@ class SyntheticRun:
         swarm, n, start = self._swarm, self.config.agents, SECOND + slot * self.config.slot_ns
         end, flown = start + self.config.slot_ns, self._next
         self._next += 1
-        self._write("/swarm/slot", start, start, slot=slot, phase=0, heard_slot=max(0, slot - 1), **self._delivery)
         swarm.scenario.advance(flown, swarm)
         senders = swarm.begin(flown)
-        frames = [swarm.frame(k) for k in senders]
-        data = np.frombuffer(b"".join(frames), np.uint8)
-        self.answer(slot, data)
-        names = [REASONS[code] for code in sorted(set(swarm.reason.tolist()))]
-        decision = {
-            "slot": slot, "agent": self._ids, "chosen": swarm.chosen.copy(), "reason_name": names,
-            "reason_index": np.array([names.index(REASONS[c]) for c in swarm.reason], np.uint8),
-            "reason": swarm.reason.copy(), "digest": swarm.digest.copy(), "score": swarm.score.copy(),
-        }  # fmt: skip
+        frames = {k + 1: swarm.frame(k) for k in senders}
+        track = swarm.track.copy() if slot else np.repeat(self._start[None], self.config.steps, 0)
+        decided = ("chosen", "reason", "digest", "score", "velocity", "command", "goal")
+        account = {name: getattr(swarm, name).copy() for name in decided}
         swarm.fly(flown)
         alone, heard = len(senders) == 1, np.zeros((len(senders), n), np.uint8)
         if alone:
             heard[0] = self._random.random(n) >= self.loss
             heard[0, senders[0]] = 0
-            swarm.hear(flown, frames[0], heard[0])
+            swarm.hear(flown, frames[senders[0] + 1], heard[0])
         swarm.end(flown)
-        sender = np.array([k + 1 for k in senders], np.uint16)
-        received = np.packbits(heard, axis=1, bitorder="little").ravel()
-        self._delivery = {
-            "sender": sender, "length": np.array([len(frame) for frame in frames], np.uint8), "data": data,
-            "received": received,
-        }  # fmt: skip
-        lost = np.array([n - 1 - heard[0].sum()] if alone else [0] * len(senders), np.uint16)
-        collided = np.array([0] if alone else [n - 1] * len(senders), np.uint16)
         record = pack_record(
-            RUN, slot, start, self.config.steps, min(2, len(senders)), **self._begin,
-            **frame_fields(dict(zip(sender.tolist(), frames, strict=True)), heard.astype(np.bool_)), lost=lost,
-            collided=collided,
+            RUN, slot, start, self.config.steps, min(2, len(senders)), agent=self._ids, track=track, **account,
+            **frame_fields(frames, heard.astype(np.bool_)),
+            lost=[n - 1 - heard[0].sum()] if alone else [0] * len(senders),
+            collided=[0] if alone else [n - 1] * len(senders),
         )  # fmt: skip
         self._write(SLOT_RECORD, start, start, record)
-        self._write(
-            "/swarm/reception", end, end, slot=slot, outcome=min(2, len(senders)), sender=sender, received=received,
-            lost=lost, collided=collided,
-        )  # fmt: skip
-        self._write("/swarm/decision", end, start, **decision)
         for number, packed in enumerate(self._odometry.pack(end, swarm.position, swarm.velocity), 1):
             self._write(f"/cf{number}/odom", end, end, packed)
         if slot % 10 == 0:
-            state = np.isin(self._ids, sender).astype(np.uint8) + 1
-            self._write("/swarm/markers", end, end, self._markers.pack(end, swarm.position, state, swarm.goal))
+            state = np.isin(self._ids, list(frames)).astype(np.uint8) + 1
+            self._write("/swarm/markers", end, start, self._markers.pack(end, swarm.position, state, swarm.goal))
 
 
 def synthetic_run(directory: Path, agents: int = 4, **options: Any) -> SyntheticRun:
@@ -191,7 +138,7 @@ def synthetic_bag(directory: Path, slots: int = 100, **options: Any) -> Syntheti
 
 def flight_bag(directory: Path, slots: int = 400, loss: float = 0.0, **settings: Any) -> None:
     """Fly and record a number of slots with fields of `SwarmConfig`; a receiver loses a frame with a probability."""
-    run = SyntheticRun(directory, SwarmConfig(**settings), loss, whole=False)
+    run = SyntheticRun(directory, SwarmConfig(**settings), loss)
     with run.writer:
         for slot in range(slots):
             run.slot(slot)

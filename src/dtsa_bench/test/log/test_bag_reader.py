@@ -17,6 +17,7 @@ from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.log.record import SLOT_RECORD
 from dtsa_bench.runs.config import RunConfig
 
 RECEPTION = "dtsa_msgs/msg/Reception"
@@ -44,8 +45,8 @@ def test_messages_are_exactly_those_recorded_in_order_of_time_and_can_be_chosen(
         assert {name: topic.count for name, topic in bag.topics.items()} == run.writer.counts
     begin, end = SECOND + 100_000_000, SECOND + 300_000_000
     with Bag(run.writer.directory) as bag:
-        found = [(m.topic, m.log_time_ns) for m in bag.messages(["/cf1/odom", "/swarm/slot"], begin, end)]
-        expected = [(topic, row[0]) for topic in ("/cf1/odom", "/swarm/slot") for row in run.written[topic]]
+        found = [(m.topic, m.log_time_ns) for m in bag.messages(["/cf1/odom", SLOT_RECORD], begin, end)]
+        expected = [(topic, row[0]) for topic in ("/cf1/odom", SLOT_RECORD) for row in run.written[topic]]
         assert sorted(found) == [entry for entry in expected if begin <= entry[1] <= end]
         with pytest.raises(UnusableBag, match="no topic '/nothing'"):
             list(bag.messages(["/nothing"]))
@@ -69,13 +70,13 @@ def test_order_holds_whatever_the_order_of_writing(tmp_path_factory, times, per_
 
 def test_damaged_message_bytes_are_an_error_that_names_the_message(run: SyntheticRun) -> None:
     with Bag(run.writer.directory) as bag:
-        whole = next(bag.messages(["/swarm/decision"]))
+        whole = next(bag.messages([SLOT_RECORD]))
         for size in range(len(whole.data) - 4):
-            with pytest.raises(BagError, match="/swarm/decision at 1"):
+            with pytest.raises(BagError, match="/swarm/slot_record at 1"):
                 bag.decode(whole._replace(data=whole.data[:size]))
         huge = bytearray(whole.data)
         huge[16:20] = b"\xff\xff\xff\x7f"  # the length of the first sequence
-        with pytest.raises(BagError, match="/swarm/decision"):
+        with pytest.raises(BagError, match="/swarm/slot_record"):
             bag.decode(whole._replace(data=bytes(huge)))
 
 
@@ -116,7 +117,7 @@ def test_bags_unfinished_damaged_or_of_others_are_refused_by_what_they_lack(run:
     with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match=r"damaged chunk.*recover"):
         list(bag.messages())
     data = bytearray(whole)
-    data[whole.rindex(b"/swarm/decision") + 3] ^= 1  # in the index
+    data[whole.rindex(b"/swarm/markers") + 3] ^= 1  # in the index
     (tmp_path / "index.mcap").write_bytes(data)
     with pytest.raises(UnusableBag, match=r"index does not fit its checksum.*recover"):
         Bag(tmp_path / "index.mcap")

@@ -38,6 +38,7 @@ from dtsa_bench.log.bag.metadata import PROFILES, load_profiles
 from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.replay import Player, ros_profile
 from dtsa_bench.log.bag.writer import BagWriter
+from dtsa_bench.log.record import SLOT_RECORD
 
 
 @pytest.fixture(scope="module")
@@ -77,13 +78,13 @@ def test_everything_or_what_is_chosen_is_played_in_order_and_the_clock_is_there_
     assert listener.clocks == sorted(listener.clocks)
     assert listener.clocks[0] == listener.messages[0].log_time_ns
     assert {message.log_time_ns for message in listener.messages} <= set(listener.clocks)
-    listener, _ = play(run, topics=["/cf1/odom", "/swarm/slot"])
-    assert {message.topic for message in listener.messages} == {"/cf1/odom", "/swarm/slot"}
+    listener, _ = play(run, topics=["/cf1/odom", SLOT_RECORD])
+    assert {message.topic for message in listener.messages} == {"/cf1/odom", SLOT_RECORD}
     listener, _ = play(run, start_s=0.5)
     assert min(message.log_time_ns for message in listener.messages) == SECOND + SECOND // 2
     listener = Listener()
     with Bag(run.writer.directory) as bag:
-        player = Player(bag, listener, rate=100.0, loop=True, topics=["/swarm/slot"])
+        player = Player(bag, listener, rate=100.0, loop=True, topics=[SLOT_RECORD])
         player.play(lambda playing: setattr(playing, "stopped", playing.round_count >= 2))
     slots = [message.log_time_ns for message in listener.messages]
     assert slots[:200] == 2 * [SECOND + k * 10_000_000 for k in range(100)]
@@ -110,7 +111,7 @@ def test_between_messages_the_clock_goes_on_at_the_rate(tmp_path: Path, rate: fl
 @pytest.mark.realtime
 @pytest.mark.parametrize("rate", [1.0, 4.0])
 def test_messages_keep_their_time(run: SyntheticRun, rate: float) -> None:
-    listener, _ = play(run, rate=rate, topics=["/swarm/slot"])
+    listener, _ = play(run, rate=rate, topics=[SLOT_RECORD])
     offsets = [
         (wall - listener.walls[0]) - (message.log_time_ns - SECOND) / rate
         for wall, message in zip(listener.walls, listener.messages, strict=True)
@@ -186,18 +187,18 @@ def test_another_process_hears_the_recorded_bytes_in_time(run: SyntheticRun, tmp
         arrived = listen(graph, run.writer.directory)
         words = ("--wait-for-subscriber", "--delay", "1.5")
         player = start_replay(run.writer.directory, *words, env=graph.environment)
-        graph.until(lambda: player.poll() is not None and len(arrived["/swarm/slot"]) >= 100)
+        graph.until(lambda: player.poll() is not None and len(arrived[SLOT_RECORD]) >= 100)
         out, error = player.communicate()
     assert player.returncode == 0, error
     assert f"played {sum(run.writer.counts.values())} messages" in out
-    assert [data for _, data in arrived["/swarm/slot"]] == [as_it_arrives(row[2]) for row in run.written["/swarm/slot"]]
+    assert [data for _, data in arrived[SLOT_RECORD]] == [as_it_arrives(row[2]) for row in run.written[SLOT_RECORD]]
     odometry = {data for _, data in arrived["/cf2/odom"]}
     assert odometry <= {as_it_arrives(row[2]) for row in run.written["/cf2/odom"]}
     assert len(odometry) >= 90  # best effort, as recorded
     clock = [clock_ns(data) for _, data in arrived["/clock"]]
     assert clock == sorted(clock)
     assert clock[0] >= SECOND
-    offsets = [wall - 10_000_000 * k for k, (wall, _) in enumerate(arrived["/swarm/slot"])]
+    offsets = [wall - 10_000_000 * k for k, (wall, _) in enumerate(arrived[SLOT_RECORD])]
     middle = statistics.median(offsets)
     assert statistics.median(abs(offset - middle) for offset in offsets) < 1_000_000
 
