@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_bench.flights.statistics import ClockStatistics
+from dtsa_bench.flights.statistics import TimingStatistics
 from dtsa_bench.log.verify.on_air import FramesOnAir
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
@@ -19,7 +20,7 @@ FRAMES = st.lists(FRAME, min_size=2, max_size=12, unique_by=lambda frame: frame[
 
 
 def sent_frames(config: ChannelConfig, frames: list[tuple[Any, ...]]) -> FramesOnAir:
-    """Frames of slot 0 and on: sender, start in ns, bytes, the agents that received it, and how many lost it, collided."""
+    """Frames of slot 0 and on: sender, start in ns, bytes, whom it reached, how many lost it, and where it collided."""
     sender, asked_ns, length, received, lost, collided = (list(column) for column in zip(*frames, strict=True))
     numbers = (np.array(column) for column in (range(len(frames)), sender, length))
     return FramesOnAir(config, *numbers, np.array(received, np.bool_), *map(np.array, (lost, collided, asked_ns)))
@@ -61,17 +62,20 @@ def test_one_wrong_receiver_never_passes(frames: list[tuple[int, int, int]], fra
 
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:
-    statistics = ClockStatistics(3)
-    statistics.add([0, 1], [1, 2], np.array([0, 400_000, 100_000, 0]), np.array([0, 0, 0, 24]))
-    statistics.add([0], [3], np.array([3_200_000]), np.array([24]))  # late by 3 ms: not a clock that is off
-    statistics.add([1], [3], np.array([100_000]), np.array([0]))
+    statistics = TimingStatistics(3)
+
+    def report(slots: list[int], agents: list[int], offsets_ns: list[int], lengths: list[int]) -> None:
+        values = {"slot": slots, "agent": agents, "offset_ns": offsets_ns, "length": lengths}
+        statistics.report(SimpleNamespace(**{name: np.array(value, np.int64) for name, value in values.items()}))
+
+    report([0, 1], [1, 2], [0, 400_000, 100_000, 0], [0, 0, 0, 24])
+    report([0], [3], [3_200_000], [24])  # late by 3 ms: not a clock that is off
+    report([1], [3], [100_000], [0])
+    report([], [1, 2], [], [])  # nothing but what was heard
     summary = statistics.summary()
     assert summary["clock_spread_max_ms"] == pytest.approx(0.4)
     assert summary["clock_spread_mean_ms"] == pytest.approx(0.2)
     assert summary["clock_spread_end_ms"] == pytest.approx(0.4)
     assert summary["sends_on_time_share"] == 0.5
     assert summary["send_offset_ms"]["3"] == {"median": pytest.approx(3.0), "max": pytest.approx(3.0)}
-    statistics.add(
-        np.zeros(0, np.uint32), [1, 2], np.zeros(0, np.int64), np.zeros(0, np.uint8)
-    )  # nothing but what was heard
-    assert ClockStatistics(3).summary()["clock_spread_max_ms"] is None
+    assert TimingStatistics(3).summary()["clock_spread_max_ms"] is None

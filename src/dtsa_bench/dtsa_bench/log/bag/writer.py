@@ -57,7 +57,7 @@ class _Channel:
 class BagWriter:
     """One bag directory being recorded. For one thread; a context manager.
 
-    :param directory: where the bag is made; must not exist, or be empty. Or the name of an .mcap file, for a bag that is
+    :param directory: where the bag is made; empty, or not there yet. Or the name of an .mcap file, for a bag of
         this file alone.
     :param config: configuration of the run, JSON types; None: the bag says nothing of its origin but `custom_data`.
     :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.

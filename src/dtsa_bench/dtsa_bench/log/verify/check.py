@@ -78,12 +78,12 @@ def _verify_agents(paths: Sequence[Path], result: Result) -> None:
 
 def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) -> None:
     mode = result.mode
-    # Missions say what they fly with instead of a mode of runs.
-    settings = bag.config if mode in (LOCKSTEP, MERGED) else {**bag.config, "mode": REALTIME}
-    contents = BagContents(bag, recorded_config(settings).swarm.slot_ns, result)
     if mode == AGENT:
         _verify_agents([bag.path], result)
         return
+    # Missions say what they fly with instead of a mode of runs.
+    settings = bag.config if mode in (LOCKSTEP, MERGED) else {**bag.config, "mode": REALTIME}
+    contents = BagContents(bag, recorded_config(settings).swarm.slot_ns, result)
     log = build_log(bag, contents.records)
     if mode == MERGED:
         check_merged(log, result)

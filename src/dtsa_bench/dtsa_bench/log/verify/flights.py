@@ -147,7 +147,7 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
         result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
     else:
         # Frames that are lost may have been on the air together with the last ones that are there.
-        until_ns = (len(log) - 1) * log.slot_ns if result.broken_off else None
+        until_ns = (len(log) - 1) * log.slot_ns if result.broken_off else 1 << 62
         received, lost, collided, count = frames.resolve_again(contents.changes, until_ns)
         counts = {name: np.zeros_like(getattr(log, name)) for name in ("lost", "collided")}
         counts["lost"][frames.slot, frames.sender - 1] = lost

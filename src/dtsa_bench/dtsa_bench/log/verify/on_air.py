@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_bench.log.arrays import FlightArrays, ReceivedFrames
-from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict
+from dtsa_channel_sim import Air, Channel, ChannelConfig
 
 from .result import Mismatch
 
@@ -51,47 +51,38 @@ class FramesOnAir:
         return cls(config, row, sender, length, received, lost, collided, asked_ns, own_clocks, log.track[:, -1])
 
     def resolve_again(
-        self, changes: Mapping[int, dict[str, Any]], until_ns: int | None = None
+        self, changes: Mapping[int, dict[str, Any]], until_ns: int = 1 << 62
     ) -> tuple[Mask, Ints, Ints, int]:
         """Make all verdicts again from the frames, their times and the channel's seed: received, lost, collided.
 
         :param changes: of the channel's settings, by the first slot in which they hold.
-        :param until_ns: leave those on frames that have not left the air by then as they are; None: none.
+        :param until_ns: verdicts on frames that have not left the air by then stay as they are.
         :returns: the arrays, and how many verdicts were made again.
         """
-        channel = Channel(self.config)
+        channel, count = Channel(self.config), 0
         for slot, values in changes.items():
             channel.set(slot=slot, **values)
-        again = tuple(values.copy() for values in (self.received, self.lost, self.collided))
-        verdicts: list[tuple[Any, ...]] = []  # frames, received, lost, collided
-        if self.own_clocks:
-            for v in self._resolve(channel):
-                verdicts.append((v.frame_id, v.received, v.lost, v.collided))
-                self.end_ns[v.frame_id], self.arrival_ns[v.frame_id] = v.end_ns, v.arrival_ns
-        else:
-            edges = np.flatnonzero(np.diff(self.slot, prepend=-1, append=-1)).tolist()
-            for frames in (slice(*edge) for edge in pairwise(edges)):
-                slot = int(self.slot[frames.start])
-                positions = None if self.positions is None else self.positions[slot]
-                sent = self.sender[frames].tolist(), self.length[frames].tolist()
-                verdict = channel.arbitrate(slot, *sent, positions)
-                verdicts.append((frames, verdict.mask(self.config.agents), verdict.lost or 0, verdict.collided or 0))
-        for frames, *verdict_of in verdicts:
-            for target, value in zip(again, verdict_of, strict=True):
-                target[frames] = value
-        late = np.zeros(len(self.slot), np.bool_) if until_ns is None else self.end_ns > until_ns
-        for target, recorded in zip(again, (self.received, self.lost, self.collided), strict=True):
-            target[late] = recorded[late]
-        return *again, int((~late).sum())
-
-    def _resolve(self, channel: Channel) -> list[FrameVerdict[int]]:
-        """The verdicts on all frames on one time line."""
-        air, verdicts = Air[int](channel), list[FrameVerdict[int]]()
-        for k in np.argsort(self.asked_ns, kind="stable").tolist():
-            air.begin(k, int(self.sender[k]), int(self.asked_ns[k]), int(self.length[k]))
-        while air.pending:
-            verdicts += air.resolve(air.due_ns)
-        return verdicts
+        received, lost, collided = self.received.copy(), self.lost.copy(), self.collided.copy()
+        if self.own_clocks:  # on one time line
+            air = Air[int](channel)
+            for k in np.argsort(self.asked_ns, kind="stable").tolist():
+                air.begin(k, int(self.sender[k]), int(self.asked_ns[k]), int(self.length[k]))
+            while air.pending:
+                for v in air.resolve(air.due_ns):
+                    k = v.frame_id
+                    self.end_ns[k], self.arrival_ns[k] = v.end_ns, v.arrival_ns
+                    if v.end_ns <= until_ns:
+                        received[k], lost[k], collided[k], count = v.received, v.lost, v.collided, count + 1
+            return received, lost, collided, count
+        edges = np.flatnonzero(np.diff(self.slot, prepend=-1, append=-1)).tolist()
+        for k in (slice(*edge) for edge in pairwise(edges)):  # the frames of a slot
+            slot = int(self.slot[k.start])
+            positions = None if self.positions is None else self.positions[slot]
+            verdict = channel.arbitrate(slot, self.sender[k].tolist(), self.length[k].tolist(), positions)
+            if (self.end_ns[k] <= until_ns).all():
+                received[k], lost[k] = verdict.mask(self.config.agents), verdict.lost or 0
+                collided[k], count = verdict.collided or 0, count + k.stop - k.start
+        return received, lost, collided, count
 
     def check_received(self, heard: ReceivedFrames, slots: int) -> tuple[int, dict[str, Any]]:
         """Whether agents took in what was delivered to them, once, and not before it was.
