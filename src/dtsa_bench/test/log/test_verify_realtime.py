@@ -1,4 +1,4 @@
-"""What `verify` finds in the bags of flights in real time."""
+"""Integration: what `verify` finds in the bags of flights in real time."""
 
 from __future__ import annotations
 
