@@ -182,7 +182,7 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
         """Fly and print what came of it."""
         from dtsa_agent.core.errors import ConfigError
         from dtsa_agent.core.settings.declaration import parse_values
-        from dtsa_bench.crazyflies.peer_lab.app import LabSettings
+        from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
         from dtsa_bench.crazyflies.peer_lab.process import fly
         from dtsa_bench.runs.options import given_options, new_directory
 
@@ -203,10 +203,8 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
         elif of_protocol:
             name, value = next(iter(of_protocol.items()))
             raise ConfigError(name, value, f"only with {PROTOCOL}")
-        summary = fly(
-            place, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
-            flags=tuple(args.flag), parameters=parameters, out=out, swarm=swarm,
-        )  # fmt: skip
+        app = read_app(place, sources=tuple(args.source), include=tuple(args.include), flags=tuple(args.flag))
+        summary = fly(app, args.seconds, settings, parameters=parameters, out=out, swarm=swarm)
         console, warnings, logs = (summary.pop(key) for key in ("console", "warnings", "logs"))
         if out is not None:
             text = json.dumps({**summary, "logs": logs}, indent=2) + "\n"

@@ -201,7 +201,7 @@ class Settings:
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain values; :meth:`from_dict` reads them back."""
-        return {spec.name: _plain(getattr(self, spec.name)) for spec in settings_of(type(self))}
+        return {spec.name: plain(getattr(self, spec.name)) for spec in settings_of(type(self))}
 
     @classmethod
     def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
@@ -255,13 +255,14 @@ def names_with_values(value: object, name: str) -> Mapping[str, Any]:
     return value
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A value as JSON and YAML have it."""
     if isinstance(value, (str, int, float)) or value is None:
         return value
     if isinstance(value, Mapping):
-        return {name: _plain(item) for name, item in value.items()}
+        return {name: plain(item) for name, item in value.items()}
     if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value.to_dict() if hasattr(value, "to_dict") else value
 
 
