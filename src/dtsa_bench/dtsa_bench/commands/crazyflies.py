@@ -93,7 +93,7 @@ def run_bridge(config: Path, *, check: bool = False) -> int:
     if check:
         # Too many for a radio is a line of the list here, not the end.
         arguments += ["--log-level", "error"]
-        return bridge_node.main(arguments, lambda node: bridge_node.check_node(node, print))
+        return bridge_node.main(arguments, bridge_node.check_bridge)
     return bridge_node.main(arguments)
 
 

@@ -19,8 +19,8 @@ from .registry import RECORDED_RUN, Command, add_rows, warn
 if TYPE_CHECKING:
     from dtsa_bench.log.bag.replay import Player
     from dtsa_bench.pages.view.graph import GraphSource
+    from dtsa_bench.pages.view.history import PageCommand
     from dtsa_bench.pages.view.network_listener import NetworkListener
-    from dtsa_bench.pages.view.page_commands import PageCommand
     from dtsa_bench.pages.view.server import ViewServer
 
 
