@@ -195,13 +195,12 @@ def summary_lines(summary: dict[str, object]) -> list[str]:
     """A summary, indented where it has parts."""
     rows = []
     for key, value in summary.items():
+        name = key.replace("_", " ")
         if isinstance(value, dict):
-            rows.append(f"{key.replace('_', ' ')}:")
-            rows += [f"  {line}" for line in summary_lines(value)]
-        elif isinstance(value, float):
-            rows.append(f"{key.replace('_', ' '):26} {value:.6g}")
+            rows += [f"{name}:", *(f"  {line}" for line in summary_lines(value))]
         else:
-            rows.append(f"{key.replace('_', ' '):26} {'-' if value in (None, []) else value}")
+            text = f"{value:.6g}" if isinstance(value, float) else "-" if value in (None, []) else value
+            rows.append(f"{name:26} {text}")
     return rows
 
 

@@ -13,49 +13,34 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-COMMANDS = {
-    "demo": "who speaks next, in nine recorded flights, a page and a picture; under a minute",
-    "fly": "one flight with real ROS 2 nodes, recorded to a bag",
-    "agent": "one agent on a real network: frames over UDP, no channel node, no ROS",
-    "simulate": "one or many flights without ROS, as fast as the machine allows",
-    "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",
-    "league": "cells that any policy flies, entries that anybody can check, and their table",
-    "new-plugin": "a package to begin with: a policy of your own, its test and a sweep",
-    "replay": "play a bag back into the ROS graph",
-    "verify": "check a bag: was every decision what the protocol says?",
-    "sniff": "listen to agents on a real network, record and judge what they send",
-    "merge": "the bags of agents on a real network as one flight: one time line, results, decisions made again",
-    "losses": "what each link lost in recorded flights: rates, bursts, distances, as a channel to fly in",
-    "recover": "make a readable bag of what a killed recorder left behind",
-    "view": "a swarm in the browser: a recorded run, one that is being recorded, one on the ROS graph or a network",
-    "report": "one web page about one or several recorded runs",
-    "export": "a bag's contents as CSV or Parquet",
-    "relay": "topics of any robots over the shared channel: losses, delay, collisions, range",
-    "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",
-    "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
-    "peer-lab": "copies of a Crazyflie app (C) on this machine: peer to peer, in virtual time",
-    "completion": "a script that completes commands, options and their values in bash or zsh",
+_COMMANDS = {  # by name: the module, and what it does
+    "demo": ("demo", "who speaks next, in nine recorded flights, a page and a picture; under a minute"),
+    "fly": ("fly", "one flight with real ROS 2 nodes, recorded to a bag"),
+    "agent": ("network", "one agent on a real network: frames over UDP, no channel node, no ROS"),
+    "simulate": ("simulation", "one or many flights without ROS, as fast as the machine allows"),
+    "sweep": ("simulation", "many simulated flights over a grid of settings; can be interrupted and resumed"),
+    "league": ("league", "cells that any policy flies, entries that anybody can check, and their table"),
+    "new-plugin": ("league", "a package to begin with: a policy of your own, its test and a sweep"),
+    "replay": ("playback", "play a bag back into the ROS graph"),
+    "verify": ("recordings", "check a bag: was every decision what the protocol says?"),
+    "sniff": ("network", "listen to agents on a real network, record and judge what they send"),
+    "merge": ("recordings", "the bags of agents on a real network as one flight: time line, results, decisions"),
+    "losses": ("recordings", "what each link lost in recorded flights, rates and bursts, as a channel to fly in"),
+    "recover": ("recordings", "make a readable bag of what a killed recorder left behind"),
+    "view": ("playback", "a swarm in the browser: one on the ROS graph, or on a network"),
+    "report": ("recordings", "one web page about one or several recorded runs"),
+    "export": ("recordings", "a bag's contents as CSV or Parquet"),
+    "relay": ("network", "topics of any robots over the shared channel: losses, delay, collisions, range"),
+    "bridge": ("crazyflies", "connect the swarm to real or simulated Crazyflie quadcopters"),
+    "fake-crazyflie": ("crazyflies", "simulated Crazyflie quadcopters that the official library connects to"),
+    "peer-lab": ("crazyflies", "copies of a Crazyflie app (C) on this machine: peer to peer, in virtual time"),
+    "completion": ("cli", "a script that completes commands, options and their values in bash or zsh"),
 }
+COMMANDS = {name: text for name, (_, text) in _COMMANDS.items()}
+_MODULES = {name: f"dtsa_bench.commands.{module}" for name, (module, _) in _COMMANDS.items()}
 
 RECORDED_RUN = "run directory, bag directory or .mcap file"  # what commands take that read one
 INTERRUPTED = 130  # exit code after Ctrl-C
-
-_MODULES = {
-    name: f"dtsa_bench.commands.{module}"
-    for module, names in {
-        "fly": ("fly",),
-        "demo": ("demo",),
-        "network": ("agent", "sniff", "relay"),
-        "simulation": ("simulate", "sweep"),
-        "league": ("league", "new-plugin"),
-        "playback": ("replay", "view"),
-        "recordings": ("verify", "merge", "losses", "recover", "report", "export"),
-        "crazyflies": ("bridge", "fake-crazyflie", "peer-lab"),
-        "cli": ("completion",),
-    }.items()
-    for name in names
-}
-
 
 Row = tuple[str, str] | tuple[str, str, dict[str, Any]]
 

@@ -60,9 +60,9 @@ every slot has the same sender and every quadcopter the same positions as with `
         summary = flight.summary()
         text = json.dumps(summary, indent=2) + "\n"
         if directory is not None:
-            (directory / "summary.json").write_text(text, encoding="utf-8")
-            written = json.dumps(config.to_dict(), indent=2) + "\n"
-            (directory / "config.json").write_text(written, encoding="utf-8")
+            settings = json.dumps(config.to_dict(), indent=2) + "\n"
+            for name, content in (("summary.json", text), ("config.json", settings)):
+                (directory / name).write_text(content, encoding="utf-8")
         print(text if args.json else describe(summary), end="")
         if picture is not None and flight.log is not None:
             from dtsa_bench.drawing import optional_picture

@@ -27,7 +27,7 @@ from .frame import (
     encode,
     encode_extended,
 )  # fmt: skip
-from .policies import NOBODY, Choice, Weights
+from .policies import NOBODY, Choice
 from .table import EXTENDED, LEAVES, OFF, ON, PAPER, Rules, Table
 
 
@@ -46,7 +46,6 @@ class Agent:
     present: int = ON
     sends: bool = False  # in this slot
     choice: Choice = NOBODY  # of this slot
-    weights: Weights = field(default_factory=Weights)  # what led to it
     memory: Memory = field(init=False)
 
     def __post_init__(self) -> None:
@@ -63,7 +62,6 @@ class Agent:
 
     def decide(self, slot: int) -> Choice:
         """Who sends in a slot, in the agent's eyes; if it is itself, it sends."""
-        self.weights = Weights()
         self.choice = self._decide(slot)
         self.sends = self.choice.index == self.index and self.present != OFF
         return self.choice
@@ -77,7 +75,7 @@ class Agent:
             return events.decide(self.memory, slot, self.far_from_goal())
         if self.rules.policy == "aloha":
             return policies.choose_aloha(self.table, slot, self.index + 1, self.rules)
-        return policies.choose(self.table, slot, self.rules, self.weights)
+        return policies.choose(self.table, slot, self.rules)
 
     def frame(self, slot: int) -> bytes:
         """The frame that the agent sends in a slot."""

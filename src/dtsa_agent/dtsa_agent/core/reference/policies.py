@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from . import estimators
 from .arithmetic import INVERSE_PI, Vector, arcsin, dot, minus, mix64, share_of, sum_in_lanes
@@ -18,28 +18,19 @@ class Choice:
     index: int  # id - 1, -1: nobody
     reason: str  # one of REASONS
     g: float = 0.0  # priority of the chosen
+    counters: list[int] | None = None  # h of all agents, where the policy has looked at them
+    priorities: list[float] | None = None  # g of all agents, likewise
 
 
 NOBODY = Choice(-1, "nobody")
 STRAIGHT = 0.02  # m/s, weight of an agent that flies straight on, with policy innovation
 
 
-@dataclass(slots=True)
-class Weights:
-    """What a policy computed on its way to a decision, for whoever wants to look; None: not computed."""
-
-    h: list[int] | None = None
-    g: list[float] | None = None
-
-
-def choose(table: Table, slot: int, rules: Rules, weights: Weights | None = None) -> Choice:
+def choose(table: Table, slot: int, rules: Rules) -> Choice:
     """Whose turn a slot is in the eyes of one table: the same for all agents whose tables are the same.
 
     ``tdma`` gives all the same update time (eq:update_time_tdma), ``age`` all of A_p (eq:update_time_NA).
-
-    :param weights: gets what was computed.
     """
-    weights = Weights() if weights is None else weights
     if rules.policy == "tdma":
         return Choice(slot % rules.agents, "tdma")
     if rules.policy == "dtsa" and rules.boot_round and slot < rules.agents:
@@ -48,26 +39,27 @@ def choose(table: Table, slot: int, rules: Rules, weights: Weights | None = None
     if outside is not None:
         return outside
     members = [k for k, row in enumerate(table.rows) if row.in_ap]
-    h = weights.h = [row.h(slot) for row in table.rows]
-    if not members:
-        return NOBODY
+    h = [row.h(slot) for row in table.rows]
     longest = oldest(h, members)
+    if not members:
+        return Choice(-1, "nobody", counters=h)
     if rules.policy == "age":
-        return Choice(longest, "oldest")
+        return Choice(longest, "oldest", counters=h)
     if rules.age_cap > 0.0 and h[longest] >= rules.age_cap * len(members):
-        return Choice(longest, "age-cap")
+        return Choice(longest, "age-cap", counters=h)
     if rules.policy == "innovation":
-        return Choice(max(members, key=lambda k: h[k] * (STRAIGHT + table.rows[k].innovation)), "innovation")
-    return choose_by_priority(table, slot, rules, weights)
+        weighed = max(members, key=lambda k: h[k] * (STRAIGHT + table.rows[k].innovation))
+        return Choice(weighed, "innovation", counters=h)
+    return choose_by_priority(table, slot, h, rules)
 
 
-def choose_by_priority(table: Table, slot: int, rules: Rules, weights: Weights) -> Choice:
+def choose_by_priority(table: Table, slot: int, h: list[int], rules: Rules) -> Choice:
     """The agent of A_p with the most urgent extrapolated state (eq:estimate, eq:permission_d_p_ang, eq:pfs)."""
     estimate = estimators.intent if rules.estimator == "intent" else estimators.linear
     believed = [estimate(row, rules, slot) for row in table.rows]
-    weights.g = priorities([p for p, _ in believed], [v for _, v in believed], rules.slot_s)
-    h = [row.h(slot) for row in table.rows]
-    return select(weights.g, h, [row.in_ap for row in table.rows], rules.epsilon, rules.selection)
+    g = priorities([p for p, _ in believed], [v for _, v in believed], rules.slot_s)
+    choice = select(g, h, [row.in_ap for row in table.rows], rules.epsilon, rules.selection)
+    return replace(choice, counters=h, priorities=g)
 
 
 def choose_outside(table: Table, slot: int, rules: Rules) -> Choice | None:

@@ -62,9 +62,9 @@ class ReferenceSwarm(Swarm):
             choice = agent.decide(slot)
             self.chosen[place], self.reason[place] = choice.index + 1, REASONS.index(choice.reason)
             self.score[place], self.digest[place], self.sends[place] = choice.g, agent.table.digest, agent.sends
-            for array, weights in ((self.counter, agent.weights.h), (self.priority, agent.weights.g)):
-                if weights is not None:
-                    array[place] = weights
+            for array, values in ((self.counter, choice.counters), (self.priority, choice.priorities)):
+                if values is not None:
+                    array[place] = values
 
     def emit(self, slot: int) -> tuple[int, ...]:
         self._read_arrays()
