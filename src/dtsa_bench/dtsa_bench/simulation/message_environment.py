@@ -1,4 +1,4 @@
-"""Environments of others whose agents know of each other what a channel carries (docs/how-to/environments.md)."""
+"""Environments of others whose agents know of each other what a channel carries (docs/how-to/relay.md)."""
 
 from __future__ import annotations
 

@@ -82,11 +82,11 @@ class LiveAir(Air[SentFrame]):
     def pop_arrived(self, now: int, positions: Positions) -> list[FrameVerdict[SentFrame]]:
         """Return the verdicts on all frames that have arrived."""
         while (due := self.due_ns) <= now - self.hold_ns:
-            self._settle(due, positions)
-        self._settle(now - self._window_ns, positions)
+            self._resolve_until(due, positions)
+        self._resolve_until(now - self._window_ns, positions)
         return self._arriving.pop(now)
 
-    def _settle(self, until_ns: int, positions: Positions) -> None:
+    def _resolve_until(self, until_ns: int, positions: Positions) -> None:
         for verdict in self.resolve(until_ns, positions):
             self._arriving.add(verdict.arrival_ns, verdict)
 

@@ -145,7 +145,7 @@ class RealtimeChannel(RosChannel):
         answers = accounts[names.FIRST_CALL]
         answers.carry(self.answers)
         self.answers = answers
-        self._settle(stop, accounts)
+        self._await_short_round(stop, accounts)
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS
@@ -168,7 +168,7 @@ class RealtimeChannel(RosChannel):
                     present.update(message.agent)
         return present
 
-    def _settle(self, stop: object, accounts: Accounts) -> None:
+    def _await_short_round(self, stop: object, accounts: Accounts) -> None:
         """Call until a round of messages, from a call to the last answer, is short enough, or for some seconds.
 
         Many processes may have found the channel and still look for each other.
