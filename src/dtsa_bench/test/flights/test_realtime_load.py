@@ -19,7 +19,7 @@ from dtsa_agent.core.delays import Delays
 from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import describe
 from dtsa_bench.flights.options import FlightOptions
-from dtsa_channel_sim.ros.live_air import Pace
+from dtsa_channel_sim.ros.realtime_channel import Pace
 
 MS = 1_000_000
 

@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start
 from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.messages import Fields, header_of, ns_of, read_report
-from dtsa_channel_sim.model.air import NEVER, FrameVerdict
+from dtsa_channel_sim.model.air import NEVER, FrameVerdict, LiveAir
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Accounts, Answers
-from .live_air import LiveAir, Pace, SentFrame
 from .ros_channel import RosChannel
 
 _NS = 1_000_000_000
@@ -49,7 +49,47 @@ _KEEP_NS = 10 * _NS  # an agent may report so late that it received a frame
 _FRAMES, _REPORTS = 64, 2
 _TIGHT = 0.6  # of a slot: a round of messages that takes longer leaves too little for the rest
 
+_STALL_SLOTS, _STALL_NS = 5, 50_000_000
+_MOST_STALLS = 1000  # kept one by one; later ones are only counted
+_BEHIND_NS, _TOO_LONG_NS = 1 * _NS, 8 * _NS  # a run that is that far behind for that long will not catch up
+
+SentFrame = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
 _read_frame = partial(deserialize_message, message_type=Frame)
+
+
+class Pace:
+    """Whether the channel keeps up with its time line, by the passes of its loop: how late it is, when it stalled."""
+
+    def __init__(self, slot_ns: int) -> None:
+        self._stall_ns = max(_STALL_SLOTS * slot_ns, _STALL_NS)
+        self.lag = Delays()  # from when a frame could have been delivered to when it was
+        self.stalls: list[tuple[int, int]] = []  # from, to
+        self.stall_count = self._last_ns = 0
+        self._behind_since_ns: int | None = None
+
+    def passed(self, now_ns: int) -> tuple[int, int] | None:
+        """The next pass begins; return from when to when the channel stood still before it, ns; None: it did not."""
+        gap, self._last_ns = (self._last_ns, now_ns), now_ns
+        if now_ns - gap[0] < self._stall_ns:
+            return None
+        self.stall_count += 1
+        if len(self.stalls) < _MOST_STALLS:
+            self.stalls.append(gap)
+        return gap
+
+    def falls_behind(self, now_ns: int, done_ns: int) -> bool:
+        """Whether a run that should have come to ``done_ns`` by now is too far behind for too long to catch up."""
+        if now_ns - done_ns < _BEHIND_NS:
+            self._behind_since_ns = None
+            return False
+        if self._behind_since_ns is None:
+            self._behind_since_ns = now_ns
+        return now_ns - self._behind_since_ns > _TOO_LONG_NS
+
+    @property
+    def behind_since_s(self) -> float:
+        """Since when the run has been behind, s from the start of slot 0."""
+        return (self._behind_since_ns or 0) / _NS
 
 
 class RealtimeChannel(RosChannel):
