@@ -324,6 +324,7 @@ def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
         config = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45)
         data = yaml.safe_load(config.read_text())
         data["robots"] = {"north_7": data["robots"]["cf1"], "south": data["robots"]["cf2"]}
+        data["station"]["max_speed_mps"] = 0.2  # a landing takes ten seconds: the second signal comes before its end
         config.write_text(yaml.safe_dump(data, sort_keys=False))
         with mission("--config", str(config), "--out", str(tmp_path / "out")) as process:
             wait_for(lambda: streaming(fleet), 60)
