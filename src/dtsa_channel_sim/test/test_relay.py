@@ -86,13 +86,14 @@ TWO: dict[str, Any] = {"robot1": {"topics": {"text": {"bytes": 20}}}, "robot2": 
 def received_numbers(graph: Graph, path: Path, channel: dict[str, Any], every_s: float) -> dict[str, set[int]]:
     """Three robots send a hundred numbers to each other, one in ``every_s``; return what came, by pair."""
     robots = ("robot1", "robot2", "robot3")
+    qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # whoever finds the other late
     node, made, reports = graph.node, [], {}  # type: ignore[var-annotated]
-    publishers = [node.create_publisher(String, f"/{robot}/text", 100) for robot in robots]
+    publishers = [node.create_publisher(String, f"/{robot}/text", qos) for robot in robots]
     numbers: dict[str, set[int]] = {f"{one} to {other}": set() for one, other in itertools.permutations(robots, 2)}
     for pair, came in numbers.items():
         one, _, other = pair.split()
         topic = f"/{other}/from/{one}/text"
-        made.append(node.create_subscription(String, topic, lambda text, came=came: came.add(int(text.data)), 100))
+        made.append(node.create_subscription(String, topic, lambda text, came=came: came.add(int(text.data)), qos))
 
     def note(message: DiagnosticArray) -> None:
         for status in message.status:

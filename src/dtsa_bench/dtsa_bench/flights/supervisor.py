@@ -14,8 +14,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.station import check_joinable
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
-from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
-from dtsa_channel_sim.ros.roster import LOST_AFTER_S
+from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S, RealtimeChannel
 
 from .children import Child, Children, NodeError, describe_end
 from .measurement import FlightMeasurement

@@ -23,6 +23,8 @@ from .medium import Mask, Medium, OnAir, Positions
 Key = TypeVar("Key", bound=Hashable)
 
 NEVER = 2**63  # ns
+_GRACE = 0.05  # of a slot: frames are handed over ahead of their start; one that is late by less still collides
+_WINDOW = 0.5  # of a slot: a frame that reaches a live channel later than this after its start is dropped
 
 
 class Media(Protocol):
@@ -285,3 +287,46 @@ class Air(Generic[Key]):
         return FrameVerdict(
             frame_id, frame.sender, slot, frame.start_ns, frame.end_ns, arrival_ns, received, lost, collided
         )
+
+
+class LiveAir(Air[tuple[int, int]]):
+    """The air of agents with clocks of their own: it is resolved a little behind the clock, when all frames are known.
+
+    A frame is named by its slot, as its sender counts, and the sender's id.
+    """
+
+    def __init__(self, channel: Media) -> None:
+        super().__init__(channel)
+        config = channel.config
+        # A delivery may come no earlier than the frame arrives.
+        self.hold_ns = max(round(_GRACE * config.slot_ns), config.airtime.from_radio_ns(0))
+        self._window_ns = max(self.hold_ns, round(_WINDOW * config.slot_ns))
+        self.frames: dict[tuple[int, int], bytes] = {}  # that are or were on the air, until their slot is closed
+        self._arriving = Arrivals()  # verdicts on frames that are on lines
+
+    @property
+    def waits(self) -> bool:
+        """Whether a frame waits for its delivery."""
+        return self.pending > 0 or self._arriving.next_ns < NEVER
+
+    def hand_over(self, key: tuple[int, int], start_ns: int, data: bytes) -> bool:
+        """Put a frame on the air; return False if it is there already, or came too late: no agent hears it."""
+        if key in self.frames or not self.begin(key, key[1], start_ns, len(data)):
+            return False
+        self.frames[key] = data
+        return True
+
+    def pop_arrived(self, now: int, positions: Positions) -> list[FrameVerdict[tuple[int, int]]]:
+        """Return the verdicts on all frames that have arrived."""
+        while (due := self.due_ns) <= now - self.hold_ns:
+            self._resolve_until(due, positions)
+        self._resolve_until(now - self._window_ns, positions)
+        return self._arriving.pop(now)
+
+    def _resolve_until(self, until_ns: int, positions: Positions) -> None:
+        for verdict in self.resolve(until_ns, positions):
+            self._arriving.add(verdict.arrival_ns, verdict)
+
+    def spare_ns(self, now: int, most_ns: int) -> int:
+        """Return for how long there is nothing to do, ns, at most ``most_ns``."""
+        return min(max(0, min(self.due_ns + self.hold_ns, self._arriving.next_ns) - now), most_ns)

@@ -97,11 +97,11 @@ class Relay:
         self._tree = TransformTree(settings.map_frame)
         self._feeds: list[tuple[Feed, Callable[[Any], None]]] = []  # what says where robots are
         for row, (name, robot) in enumerate(self._robots.items()):
-            if robot.place:
-                self._positions[:, row] = robot.place
-            elif robot.odometry:
+            if robot.odometry:
                 topic = full_name(name, robot.odometry, "odometry")
                 self._follow("nav_msgs/msg/Odometry", topic, partial(self._accept_odometry, row))
+            elif not robot.tf:
+                self._positions[:, row] = robot.place or 0.0  # 0: it does not matter
         for topic in ("/tf", "/tf_static") if any(robot.tf for robot in self._robots.values()) else ():
             self._follow("tf2_msgs/msg/TFMessage", topic, self._tree.accept)
 
@@ -159,9 +159,7 @@ class Relay:
         """Look for topics; now and then say what is missing, and how pairs are doing."""
         self._awaited = [topic for topic in self._awaited if not self._open(topic)]
         missing = [topic.source for topic in self._awaited]
-        for (name, robot), place in zip(self._robots.items(), self._positions.T, strict=True):
-            if np.isnan(place[0]) and (robot.odometry or robot.tf):
-                missing.append(f"the place of {name} ({robot.odometry or robot.tf})")
+        missing += [f"the place of {self._names[row]}" for row in np.flatnonzero(np.isnan(self._positions[0]))]
         if tick % _REMIND_TICKS == _REPORT_TICKS:
             for text in missing:
                 self._logger.info(f"waits for {text}")
@@ -203,8 +201,9 @@ class Relay:
         return True
 
     def _send(self, topic: RelayedTopic, data: bytes, number: int) -> None:
-        length, now_ns, payload = topic.bytes or len(data), self._update_time(), (topic.source, data)
-        if not (fault := self._transport.fault_of(length)):
+        length, payload = topic.bytes or len(data), (topic.source, data)
+        fault, now_ns = self._transport.fault_of(length), self._update_time()
+        if not fault:
             message = RadioMessage(topic.robot, topic.name, number, length, now_ns, topic.receivers, payload)
             self._transport.send(message)
         elif topic.source not in self._refused:

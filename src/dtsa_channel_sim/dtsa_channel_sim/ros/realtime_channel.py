@@ -6,6 +6,8 @@ Times are ns from the start of slot 0, unless said otherwise; positions are (3, 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -21,17 +23,21 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start
 from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.messages import Fields, header_of, ns_of, read_report
-from dtsa_channel_sim.model.air import NEVER, Air, Arrivals, FrameVerdict
+from dtsa_channel_sim.model.air import NEVER, FrameVerdict, LiveAir
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.medium import Positions
 from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Accounts, Answers
 from .ros_channel import RosChannel
-from .roster import Attendance, RollCall
 
 _NS = 1_000_000_000
 _TICK_NS = 2_000_000  # longest wait for a frame
+LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
+_RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
+_LONGEST_S = 0.5  # of one round of messages before slot 0
+_SETTLED_S = 10.0  # after that the run starts, however long rounds take
+_PAUSE_S = 0.0001
+_BURST = 256  # messages; whatever comes, the clock is looked at
 _START_S = 1.0  # the start is published again so often, for processes that come later
 _LEAD_NS = 300_000_000  # from the start message to slot 0
 _PATIENCE_SLOTS, _PATIENCE_NS = 10, 500_000_000  # an account waits for reports at least so long
@@ -42,8 +48,7 @@ _KEEP_NS = 10 * _NS  # an agent may report so late that it received a frame
 # What one pass of the loop does at most: frames, reports. Then it checks the clock and signals again.
 _FRAMES, _REPORTS = 64, 2
 _TIGHT = 0.6  # of a slot: a round of messages that takes longer leaves too little for the rest
-_GRACE = 0.05  # of a slot: frames are handed over ahead of their start; one that is late by less still collides
-_WINDOW = 0.5  # of a slot: a frame that reaches the channel later than this after its start is dropped
+
 _STALL_SLOTS, _STALL_NS = 5, 50_000_000
 _MOST_STALLS = 1000  # kept one by one; later ones are only counted
 _BEHIND_NS, _TOO_LONG_NS = 1 * _NS, 8 * _NS  # a run that is that far behind for that long will not catch up
@@ -87,46 +92,6 @@ class Pace:
         return (self._behind_since_ns or 0) / _NS
 
 
-class LiveAir(Air[SentFrame]):
-    """One time line of frames: time is settled a little behind the clock, when all handed over in time is known."""
-
-    def __init__(self, channel: Channel) -> None:
-        super().__init__(channel)
-        config = channel.config
-        # A delivery may come no earlier than the frame arrives.
-        self.hold_ns = max(round(_GRACE * config.slot_ns), config.airtime.from_radio_ns(0))
-        self._window_ns = max(self.hold_ns, round(_WINDOW * config.slot_ns))
-        self.frames: dict[SentFrame, bytes] = {}  # that are or were on the air, until their slot is closed
-        self._arriving = Arrivals()  # verdicts on frames that are on lines
-
-    @property
-    def waits(self) -> bool:
-        """Whether a frame waits for its delivery."""
-        return self.pending > 0 or self._arriving.next_ns < NEVER
-
-    def hand_over(self, key: SentFrame, start_ns: int, data: bytes) -> bool:
-        """Put a frame on the air; return False if it is there already, or came too late: no agent hears it."""
-        if key in self.frames or not self.begin(key, key[1], start_ns, len(data)):
-            return False
-        self.frames[key] = data
-        return True
-
-    def pop_arrived(self, now: int, positions: Positions) -> list[FrameVerdict[SentFrame]]:
-        """Return the verdicts on all frames that have arrived."""
-        while (due := self.due_ns) <= now - self.hold_ns:
-            self._resolve_until(due, positions)
-        self._resolve_until(now - self._window_ns, positions)
-        return self._arriving.pop(now)
-
-    def _resolve_until(self, until_ns: int, positions: Positions) -> None:
-        for verdict in self.resolve(until_ns, positions):
-            self._arriving.add(verdict.arrival_ns, verdict)
-
-    def spare_ns(self, now: int, most_ns: int) -> int:
-        """Return for how long there is nothing to do, ns, at most ``most_ns``."""
-        return min(max(0, min(self.due_ns + self.hold_ns, self._arriving.next_ns) - now), most_ns)
-
-
 class RealtimeChannel(RosChannel):
     """Medium of a swarm whose agents have clocks of their own.
 
@@ -149,7 +114,9 @@ class RealtimeChannel(RosChannel):
         self.air = LiveAir(channel)
         self.pace = Pace(self.slot_ns)
         self.round_ms: float | None = None  # of the last round of messages before slot 0
-        self._attendance = Attendance(self.agents, self.lost)
+        self.returned: set[int] = set()  # ids of agents that were lost, and report again
+        self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
+        self._heard_ns = np.zeros(self.agents, dtype=np.int64)  # when each was heard last
         self._steps = steps
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0
         self._start_published_s = 0.0  # time.monotonic() of the last start message
@@ -178,17 +145,19 @@ class RealtimeChannel(RosChannel):
         """Note that an agent comes after the start; its vehicle waits at a place, (3,) m."""
         self.answers.track[:, :, agent - 1] = place
         self.lose(agent)
-        self._attendance.expect_later(agent)
+        self._given_up[agent] = -_RETURN_SLOTS
 
     def lose(self, agent: int) -> None:
         """Note that an agent is gone."""
-        if self._attendance.lose(agent, self._now() // self.slot_ns):
+        if agent not in self.lost:
+            self.lost.add(agent)
+            self.returned.discard(agent)
+            self._given_up[agent] = self._now() // self.slot_ns
             self._observers.agent_silent(agent)
 
-    @property
-    def returned(self) -> set[int]:
-        """Ids of the agents that were lost, and report again."""
-        return self._attendance.returned
+    def _hear(self, agents: Sequence[int], now: int) -> None:
+        index = np.array(agents, dtype=np.intp) - 1
+        self._heard_ns[index] = np.maximum(self._heard_ns[index], now)
 
     def last_place(self, agent: int) -> NDArray[np.float64]:
         """Return the last position that an agent has reported, (3,) m."""
@@ -202,36 +171,60 @@ class RealtimeChannel(RosChannel):
         if not self._call(stop, self.lost):
             return False
         accounts = Accounts(self.agents, self._steps, 1)
-        roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling, accounts)
         awaited = set(range(1, self.agents + 1))
 
         def still_awaited() -> set[int]:
-            awaited.difference_update(roll_call.present())
+            awaited.difference_update(self._answered_call(names.FIRST_CALL, accounts))
             self.answers.missing = len(awaited)
             self.answers.answered[:] = [agent not in awaited for agent in range(1, self.agents + 1)]
             return awaited - self.lost
 
-        if not self._await_all(stop, roll_call.call, still_awaited, _TICK_NS):
+        if not self._await_all(stop, still_awaited, _TICK_NS):
             return False
         # An agent that is late with its first report has been nowhere else.
         answers = accounts[names.FIRST_CALL]
         answers.carry(self.answers)
         self.answers = answers
-        absent = set(self.lost)
-
-        def is_disturbed() -> bool:
-            self._housekeeping()
-            return bool(stop) or self.lost != absent
-
-        present = set(range(1, self.agents + 1)) - absent
-        self.round_ms = roll_call.await_short_round(present, _TIGHT * self.slot_ns / 1e6, is_disturbed)
+        self._await_short_round(stop, accounts)
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS
         self._publish_start()
         self._observers.start_known(self._zero / _NS)
-        self._attendance.begin()
+        self._heard_ns[:] = 0
         return True
+
+    def _answered_call(self, number: int, accounts: Accounts) -> set[int]:
+        """Return the agents whose answers to a call of this number have come since this was asked."""
+        present: set[int] = set()
+        for _ in range(_BURST):
+            data = self._reports.take()
+            if data is None:
+                break
+            with suppress(Exception):  # rclpy has no common base for what a message can do to it
+                message = read_report(data)
+                if message.run == self.run_id and message.slot.tolist() == [number]:
+                    accounts.add(message, number)
+                    present.update(message.agent)
+        return present
+
+    def _await_short_round(self, stop: object, accounts: Accounts) -> None:
+        """Call until a round of messages, from a call to the last answer, is short enough, or for some seconds.
+
+        Many processes may have found the channel and still look for each other.
+        """
+        end_s, absent, number = time.monotonic() + _SETTLED_S, set(self.lost), names.FIRST_CALL
+        while not stop and self.lost == absent and time.monotonic() < end_s:
+            begin_s, awaited = time.monotonic(), set(range(1, self.agents + 1)) - absent
+            number += 1
+            self._publish_call(number)
+            while awaited and time.monotonic() < begin_s + _LONGEST_S:
+                time.sleep(_PAUSE_S)
+                awaited -= self._answered_call(number, accounts)
+            self.round_ms = (time.monotonic() - begin_s) * 1e3
+            if not self.tight:
+                return
+            self._housekeeping()
 
     @property
     def tight(self) -> bool:
@@ -288,7 +281,7 @@ class RealtimeChannel(RosChannel):
         """After a stall: what was handed over meanwhile is too late for the air, and silence counts for no agent."""
         self._deliver_arrived(now)
         self._recovered_ns = now + (_RECOVERY_NS if now - before > self._patience_ns else self._patience_ns)
-        self._attendance.excuse(now - before, self._recovered_ns)
+        self._heard_ns[:] = np.maximum(self._heard_ns + (now - before), self._recovered_ns)
 
     def _falls_behind(self, now: int) -> bool:
         """Whether the run cannot keep up, by its accounts or by the agents' reports."""
@@ -326,7 +319,7 @@ class RealtimeChannel(RosChannel):
         if slot > self.slot:
             self.accounts[slot].frames[agent] = frame
         self._observers.frame_sent(slot, agent, frame, start_ns)
-        self._attendance.hear((agent,), now)
+        self._hear((agent,), now)
 
     def _deliver_arrived(self, now: int) -> None:
         """Send all frames whose time has come to those that received them."""
@@ -365,7 +358,7 @@ class RealtimeChannel(RosChannel):
         if len(message.slot) and message.slot[0] >= names.FIRST_CALL:
             return  # an answer to a call, which has come late
         self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
-        self._attendance.hear(message.agent, now)
+        self._hear(message.agent, now)
         self._observers.report(message)
 
     def _can_close(self, now: int) -> bool:
@@ -404,10 +397,15 @@ class RealtimeChannel(RosChannel):
     def _completed(self, slot: int) -> Answers:
         """Return a slot's reports, those that are missing copied from the slot before."""
         book = self.accounts[slot]
-        again = self._attendance.back(slot, book.answered) if self.lost else []
-        if again:
-            self._observers.agents_back(again)
+        back = [a for a in sorted(self.lost) if book.answered[a - 1] and slot > self._given_up[a] + _RETURN_SLOTS]
+        if back:
+            self.lost.difference_update(back)
+            self.returned.update(back)
+            self._observers.agents_back(back)
         book.carry(self.answers)
-        for agent in self._attendance.silent_too_long(book.silent):
-            self.lose(agent)
+        # Agents are compared with the others: if none is heard, it may be the channel that got no time.
+        silent_ns = self._heard_ns.max() - self._heard_ns
+        for agent in book.silent:
+            if silent_ns[agent - 1] > LOST_AFTER_S * _NS:
+                self.lose(agent)
         return book

@@ -134,19 +134,20 @@ class RosChannel:
         """
         with self._watch_other_channels() as check_others:
 
-            def call() -> None:
-                data = self._calling
-                self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, slot=names.FIRST_CALL, data=data))
-
             def awaited() -> set[int]:
                 self._read_processes()
                 check_others()
                 return self.roster.awaited(time.monotonic(), absent)
 
-            self.roster.closed = self._await_all(stop, call, awaited, _CALL_NS)
+            self.roster.closed = self._await_all(stop, awaited, _CALL_NS)
         return self.roster.closed
 
-    def _await_all(self, stop: object, call: Callable[[], None], awaited: Callable[[], set[int]], wait_ns: int) -> bool:
+    def _publish_call(self, number: int) -> None:
+        """Call the agents; each number is answered once."""
+        data = self._calling
+        self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, slot=number, data=data))
+
+    def _await_all(self, stop: object, awaited: Callable[[], set[int]], wait_ns: int) -> bool:
         """Call again and again until no agent is awaited any more; return False when stopped.
 
         :raises LocalProtocolError: when some do not answer in time.
@@ -158,7 +159,7 @@ class RosChannel:
             now = time.monotonic()
             if now - repeat > REPEAT_S:
                 repeat = now
-                call()
+                self._publish_call(names.FIRST_CALL)
             self.loop.wait(wait_ns)  # what comes before the run begins does not count
             self._housekeeping()
             if patience.spent_s() > self._startup_s:

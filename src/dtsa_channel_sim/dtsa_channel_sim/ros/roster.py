@@ -1,40 +1,25 @@
-"""Who takes part in a run: its processes before slot 0, and which agents are heard, lost and back in real time."""
+"""Who takes part in a run: the processes of its agents."""
 
 from __future__ import annotations
 
-import time
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Set
-from contextlib import suppress
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from dtsa_msgs.msg import Process, Slot
-from numpy.typing import NDArray
-from rclpy.publisher import Publisher
+from dtsa_msgs.msg import Process
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import settings_hash
-from dtsa_agent.ros.common import checks, names
+from dtsa_agent.ros.common import checks
 from dtsa_agent.ros.common.checks import BadMessage
-from dtsa_agent.ros.common.loop import Feed
-from dtsa_agent.ros.common.messages import read_report
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_agent.ros.common.runs import run_text
-
-from .answers import Accounts
 
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s
 _LEFT_OVER_S = 3.0  # agents whose channel has gone end within this time
 _MOST_OTHERS = 256  # processes of other runs, or for the same agents
-LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
-_RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
-_LONGEST_S = 0.5  # of one round of messages
-_SETTLED_S = 10.0  # after that the run starts, however long rounds take
-_PAUSE_S = 0.0001
-_BURST = 256  # messages; whatever comes, the clock is looked at
 
 
 @dataclass(slots=True)
@@ -207,104 +192,3 @@ def _admit(member: Member | None, ids: Any, sender: bytes | None) -> None:
 
 def _key(ids: tuple[int, ...]) -> bytes:
     return array("H", ids).tobytes()
-
-
-class Attendance:
-    """Keeps the ids of lost agents in ``lost``, in real time. Times are ns from the start of slot 0; agents are ids."""
-
-    def __init__(self, agents: int, lost: set[int]) -> None:
-        self._lost = lost
-        self.returned: set[int] = set()  # ids of those that were lost, and report again
-        self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
-        self._heard_ns = np.zeros(agents, dtype=np.int64)  # when each was heard last
-
-    def begin(self) -> None:
-        """Slot 0 is near: no agent has been heard yet."""
-        self._heard_ns[:] = 0
-
-    def lose(self, agent: int, slot: int) -> bool:
-        """Note in the present slot that an agent is gone; return whether that is new."""
-        if agent in self._lost:
-            return False
-        self._lost.add(agent)
-        self.returned.discard(agent)
-        self._given_up[agent] = slot
-        return True
-
-    def expect_later(self, agent: int) -> None:
-        """Note that a lost agent may come from slot 0 on."""
-        self._given_up[agent] = -_RETURN_SLOTS
-
-    def hear(self, agents: Iterable[int], now: int) -> None:
-        """Agents were heard."""
-        index = np.fromiter(agents, dtype=np.intp) - 1
-        self._heard_ns[index] = np.maximum(self._heard_ns[index], now)
-
-    def excuse(self, stalled_ns: int, until_ns: int) -> None:
-        """The channel has stood still: silence until then counts for no agent."""
-        self._heard_ns[:] = np.maximum(self._heard_ns + stalled_ns, until_ns)
-
-    def back(self, slot: int, answered: NDArray[np.bool_]) -> list[int]:
-        """Return the lost agents that have reported for a slot; they are not lost any more."""
-        again = [a for a in sorted(self._lost) if answered[a - 1] and slot > self._given_up[a] + _RETURN_SLOTS]
-        self._lost.difference_update(again)
-        self.returned.update(again)
-        return again
-
-    def silent_too_long(self, agents: Iterable[int]) -> list[int]:
-        """Return which of some agents are to be taken for lost.
-
-        They are compared with the others: if none is heard, it may be the channel that got no time.
-        """
-        newest = int(self._heard_ns.max())
-        return [agent for agent in agents if newest - self._heard_ns[agent - 1] > LOST_AFTER_S * 1e9]
-
-
-class RollCall:
-    """Calls all agents before slot 0 in real time, by number, until all answer in time.
-
-    ``accounts`` get the answers, ``calling`` is the call as slot messages carry it.
-    """
-
-    def __init__(
-        self, publisher: Publisher, reports: Feed, run_id: int, calling: array[int], accounts: Accounts
-    ) -> None:
-        self._publisher, self._reports, self._run_id, self._calling = publisher, reports, run_id, calling
-        self._accounts = accounts
-        self._number = names.FIRST_CALL
-
-    def call(self) -> None:
-        """Call, with the same number until a round is measured."""
-        data = self._calling
-        self._publisher.publish(Slot(run=self._run_id, phase=Slot.PREPARE, slot=self._number, data=data))
-
-    def present(self) -> set[int]:
-        """Return the agents that have answered the last call since this was asked."""
-        present: set[int] = set()
-        for _ in range(_BURST):
-            data = self._reports.take()
-            if data is None:
-                break
-            with suppress(Exception):  # rclpy has no common base for what a message can do to it
-                message = read_report(data)
-                if message.run == self._run_id and message.slot.tolist() == [self._number]:
-                    self._accounts.add(message, self._number)
-                    present.update(message.agent)
-        return present
-
-    def await_short_round(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
-        """Call until a round of messages, from a call to the last answer, is short enough, or for some seconds.
-
-        Many processes may have found the channel and still look for each other. Return how long the last round took.
-        """
-        end_s = time.monotonic() + _SETTLED_S
-        while True:
-            begin_s, awaited = time.monotonic(), set(agents)
-            self._number += 1
-            self.call()
-            while awaited and time.monotonic() < begin_s + _LONGEST_S:
-                time.sleep(_PAUSE_S)
-                awaited -= self.present()
-            took_ms = (time.monotonic() - begin_s) * 1e3
-            if took_ms <= enough_ms or time.monotonic() > end_s or give_up():
-                return took_ms
