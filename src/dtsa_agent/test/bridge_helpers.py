@@ -120,7 +120,7 @@ class Flight:
         while not self.stop.wait(0.02):
             for name, velocity in self.velocity.items():
                 if velocity is not None:
-                    self.bridge.vehicles[name].controls.command(velocity_world(velocity, 0.0, time.monotonic()))
+                    self.bridge.vehicles[name].command(velocity_world(velocity, 0.0, time.monotonic()))
 
     def take_off(self) -> None:
         """Arm, climb to the middle of the room, and begin to stream zero velocity."""

@@ -1,89 +1,96 @@
-"""A Crazyradio 2.0 as the port of an agent: broadcasts between Crazyflies, with the dongle's times of arrival."""
+"""A Crazyradio 2.0 in sniffer mode as the port of an agent: broadcasts between Crazyflies, through pyusb."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import importlib.util
 import time
+from collections import deque
 from pathlib import Path
+from typing import Any
 
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.priority import realtime_thread
 
-from .crazyradio_dongle import PacketReader, SnifferDongle, broadcast, datagram_in
-from .device_port import DevicePort
+from . import crazyradio_packets as radio
+from .crazyradio_packets import PacketReader, broadcast, datagram_in
+from .device_port import FAULTS, DevicePort, reason
 from .settings import CrazyradioSettings
 
+_VENDOR, _PRODUCT = 0x1915, 0x7777
+_OUT, _IN = 0x01, 0x81
+_READ_MS, _WRITE_MS, _REQUEST_MS = 100, 20, 1000
+_BY_NUMBER = 4  # digits at most; a serial number has ten
+_REASONS = {
+    errno.EACCES: "one that this user may open: a udev rule gives the right (docs/how-to/radios.md)",
+    errno.EBUSY: "one that no other program uses",
+}
+_HOW = "tools/dtsa setup --extra cflib, or pip install pyusb libusb-package"
 _US, _SECOND = 1_000, 1_000_000_000
 _COUNTS_NS = _SECOND  # from one question for the dongle's counts to the next
 _PRIORITY = 20
 _TURN_US = 1 << 32  # after 71.6 minutes a stamp starts at 0 again
-_LEAK = 10_000  # the map may be late by a 10,000th more with each ns: clocks of crystals differ by less
 _LATEST_NS = 60 * _SECOND  # later than this nothing is read: the longest sleep of a process
-_EARLIEST_NS = _SECOND  # the map does not move towards earlier arrivals by more than this at once: the first was late
+_EARLIEST_NS = _SECOND  # nothing is read by so much earlier than all others
+_WINDOW = 96  # packets, of which one at least is read without delay
+_OLDEST_NS = 10 * _SECOND  # clocks of crystals differ by less than 1 ms within this time
 _FIT_NS = 10_000_000  # stamps fit each other to this
-_ODD = 3  # stamps in a row that fit each other and not the map: the dongle was restarted
-_WINDOW = 64  # packets, of which one at least is read without delay
+_ODD = 3  # stamps in a row that fit each other and no others: the dongle was restarted
 
 
 class DongleClock:
     """Turns stamps of a dongle, 32 bits of microseconds, into CLOCK_MONOTONIC.
 
-    USB is never early. So the shortest time between a stamp and its arrival tells how far the clocks are apart, and how
-    much later another packet arrived does not matter. That shortest time itself counts as part of a packet's flight.
+    USB is never early. So the shortest time between a stamp and its arrival, of the last packets, tells how far the
+    clocks are apart, and how much later another packet arrived does not matter. That shortest time itself counts as
+    part of a packet's flight.
     """
 
     def __init__(self) -> None:
-        self._ahead_ns: int | None = None  # the computer's clock, of the dongle's; None: nothing is known
-        self._last_ns = 0  # when that was known
-        self._odd_ns = 0  # how far it is ahead by the last stamp that did not fit
+        # Of the last packets: when each was read, and by how much that is ahead of its stamp, ns.
+        self._packets: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
+        self._odd_ns = 0  # by how much it was ahead of the last stamp that did not fit
         self._odd = 0  # how many of these came in a row
-        self._least_ns, self._count = _LATEST_NS, 0  # smallest delay of the packets in this window, and their number
         self.unusable = 0  # stamps
 
     def arrival_ns(self, stamp_us: int, read_ns: int) -> int:
         """When a packet was whole, CLOCK_MONOTONIC, ns; when it was read (ns), if its stamp tells nothing."""
-        if self._ahead_ns is None:
-            self._ahead_ns, self._last_ns = read_ns - stamp_us * _US, read_ns
-            return read_ns
-        drift = max(read_ns - self._last_ns, 0) // _LEAK
-        ahead = self._ahead_ns + drift
-        turns = ((read_ns - ahead) // _US - stamp_us + _TURN_US // 2) // _TURN_US
-        now_ahead = read_ns - (stamp_us + turns * _TURN_US) * _US
-        late = now_ahead - ahead
-        if not -_EARLIEST_NS - 2 * drift < late < _LATEST_NS:
-            self._odd = self._odd + 1 if abs(now_ahead - self._odd_ns) < _FIT_NS else 1
-            self._odd_ns = now_ahead
+        packets = self._packets
+        while packets and read_ns - packets[0][0] > _OLDEST_NS:
+            packets.popleft()
+        least_ns = min((ahead for _, ahead in packets), default=read_ns - stamp_us * _US)
+        turns = ((read_ns - least_ns) // _US - stamp_us + _TURN_US // 2) // _TURN_US
+        ahead_ns = read_ns - (stamp_us + turns * _TURN_US) * _US
+        late_ns = ahead_ns - least_ns
+        if not -_EARLIEST_NS < late_ns < _LATEST_NS:
+            self._odd = self._odd + 1 if abs(ahead_ns - self._odd_ns) < _FIT_NS else 1
+            self._odd_ns = ahead_ns
             if self._odd < _ODD:
                 self.unusable += 1
-            else:
-                self._ahead_ns, self._last_ns = now_ahead, read_ns
-            return read_ns
+                return read_ns
+            packets.clear()
+            late_ns = 0
         self._odd = 0
-        self._ahead_ns, self._last_ns = min(ahead, now_ahead) + self._bias_ns(late), read_ns
-        return read_ns - max(late, 0)
-
-    def _bias_ns(self, late_ns: int) -> int:
-        """How much too early all packets seem to arrive since a wrong stamp."""
-        self._least_ns, self._count = min(self._least_ns, late_ns), self._count + 1
-        if self._count < _WINDOW:
-            return 0
-        least, self._least_ns, self._count = self._least_ns, _LATEST_NS, 0
-        return least if least > _FIT_NS else 0
+        packets.append((read_ns, ahead_ns))
+        return read_ns - max(late_ns, 0)
 
 
-class CrazyradioPort(DevicePort[SnifferDongle]):
-    """A Crazyradio; see :class:`~dtsa_agent.air.device_port.DevicePort`.
+class CrazyradioPort(DevicePort):
+    """A Crazyradio that hears all broadcasts between Crazyflies on its channel, and sends some.
 
     :raises ConfigError: if it cannot be used.
     """
 
     def __init__(self, settings: CrazyradioSettings) -> None:
         self._settings = settings
-        self._others = self._dropped = self._dropped_before = self._garbled = self._unusable = 0
+        self._others = self._dropped = self._garbled = self._unusable = 0
         super().__init__(f"dongle {settings.uri}", "dongle", settings.properties)
 
     def counts(self) -> dict[str, int]:
         """Return what the dongle has lost, what else was on the air, and how often it was unplugged."""
         return {
-            "dropped_by_dongle": self._dropped_before + self._dropped,
+            "dropped_by_dongle": self._dropped,
             "dropped_by_computer": self.overflowed,
             "other_packets": self._others,
             "garbled_transfers": self._garbled,
@@ -95,21 +102,74 @@ class CrazyradioPort(DevicePort[SnifferDongle]):
         with realtime_thread(_PRIORITY):  # as agents do: what they wait for comes by this thread
             super()._run()
 
-    def _open(self) -> SnifferDongle:
-        if not self._settings.simulated_radio:
-            return SnifferDongle(self._settings)
-        from .crazyradio_simulated import simulated_dongles
+    def _open(self) -> Any:
+        """Return a ``usb.core.Device`` in sniffer mode."""
+        settings = self._settings
+        uri, address = settings.uri, settings.address
+        if importlib.util.find_spec("usb") is None:
+            raise ConfigError("pyusb", "not installed", _HOW)
+        import usb.core
+        import usb.util
 
-        return SnifferDongle(self._settings, simulated_dongles(Path(self._settings.simulated_radio)))
+        device = None
+        try:
+            devices = _devices(settings.simulated_radio)
+            if len(address.radio) <= _BY_NUMBER and address.radio.isdigit():
+                matches = devices[int(address.radio) : int(address.radio) + 1]
+            else:
+                matches = [one for one in devices if str(one.serial_number).upper() == address.radio.upper()]
+            if not matches:
+                raise ConfigError("uri", uri, f"a Crazyradio that is plugged in; there are {len(devices)}")
+            device = matches[0]
+            version = int(device.bcdDevice)
+            if version < radio.FIRST_FIRMWARE:
+                firmware = f"{uri}: firmware {version >> 8:x}.{version & 0xFF:x}"
+                raise ConfigError("uri", firmware, "a Crazyradio 2.0 with firmware 5.4 or later: it has sniffer mode")
+            device.set_configuration(1)
+            usb.util.claim_interface(device, 0)
+            _request(
+                device, radio.SET_RADIO_MODE, radio.NORMAL
+            )  # it may have been left otherwise: begin with an empty queue
+            _request(device, radio.SET_RADIO_CHANNEL, address.channel)
+            _request(device, radio.SET_DATA_RATE, address.rate_mbps)
+            _request(device, radio.SET_RADIO_ADDRESS, 0, radio.BROADCAST)
+            _request(device, radio.SET_RADIO_MODE, radio.SNIFFER)
+        except usb.core.NoBackendError:
+            raise ConfigError("libusb", "not found", f"libusb 1.0: {_HOW}") from None
+        except ConfigError:
+            raise
+        except (*FAULTS, ValueError) as error:  # ValueError: it may not read the serial number
+            if device is not None:
+                usb.util.dispose_resources(device)
+            number = errno.EACCES if isinstance(error, ValueError) else getattr(error, "errno", None) or 0
+            allowed = _REASONS.get(number) or f"a dongle that does what it is told ({reason(error)})"
+            raise ConfigError("uri", uri, allowed) from None
+        return device
 
-    def _write(self, device: SnifferDongle, data: bytes) -> None:
-        device.write(broadcast(data, self._settings.p2p_port))
+    def _close(self, device: Any) -> None:
+        """Leave it as after plugging in."""
+        import usb.util
 
-    def _read(self, device: SnifferDongle) -> None:
-        reader, clock = PacketReader(), DongleClock()
-        garbled, unusable, counts_due_ns = self._garbled, self._unusable, 0
+        with contextlib.suppress(*FAULTS):
+            _request(device, radio.SET_RADIO_MODE, radio.NORMAL)
+        usb.util.dispose_resources(device)
+
+    def _write(self, device: Any, data: bytes) -> None:
+        """Send a packet; when it leaves is not known."""
+        transfer = broadcast(data, self._settings.p2p_port)
+        device.write(_OUT, transfer, _WRITE_MS)
+        if not len(transfer) % radio.USB_PACKET:
+            device.write(_OUT, b"", _WRITE_MS)
+
+    def _read(self, device: Any) -> None:
+        import usb.core
+
+        reader, clock, counts_due_ns = PacketReader(), DongleClock(), 0
+        before = self._dropped, self._garbled, self._unusable  # by the dongle, until it was unplugged
         while not self._stopped.is_set():
-            data = device.read()
+            data = b""
+            with contextlib.suppress(usb.core.USBTimeoutError):
+                data = bytes(device.read(_IN, 2 * radio.USB_PACKET, _READ_MS))
             now = time.monotonic_ns()
             for packet in reader.feed(data):
                 arrival_ns = clock.arrival_ns(packet.stamp_us, now)
@@ -120,8 +180,27 @@ class CrazyradioPort(DevicePort[SnifferDongle]):
                     self._queue(datagram, arrival_ns, False)
             if now >= counts_due_ns:
                 counts_due_ns = now + _COUNTS_NS
-                self._dropped = device.dropped()
-                self._garbled, self._unusable = garbled + reader.garbled, unusable + clock.unusable
+                dropped = bytes(
+                    device.ctrl_transfer(radio.VENDOR_IN, radio.GET_SNIFFER_DROP_COUNT, 0, 0, 4, _REQUEST_MS)
+                )
+                counts = int.from_bytes(dropped, "little"), reader.garbled, clock.unusable
+                self._dropped, self._garbled, self._unusable = map(sum, zip(before, counts, strict=True))
 
-    def _lost(self) -> None:
-        self._dropped_before, self._dropped = self._dropped_before + self._dropped, 0
+
+def _request(device: Any, number: int, value: int, data: bytes = b"") -> None:
+    device.ctrl_transfer(radio.VENDOR_OUT, number, value, 0, data, _REQUEST_MS)
+
+
+def _devices(simulated_radio: str) -> list[Any]:
+    import usb.core
+
+    if simulated_radio:
+        from .crazyradio_simulated import simulated_dongles
+
+        return simulated_dongles(Path(simulated_radio))
+    backend = None  # pyusb looks for a libusb of the system
+    if importlib.util.find_spec("libusb_package") is not None:
+        import libusb_package
+
+        backend = libusb_package.get_libusb1_backend()
+    return list(usb.core.find(idVendor=_VENDOR, idProduct=_PRODUCT, find_all=True, backend=backend) or ())

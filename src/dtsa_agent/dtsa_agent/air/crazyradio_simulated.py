@@ -19,7 +19,7 @@ import usb.core
 
 from dtsa_agent.core.errors import ConfigError
 
-from .crazyradio_dongle import FIRST_FIRMWARE, GET_SNIFFER_DROP_COUNT, SET_RADIO_MODE, SNIFFER, VENDOR_IN, VENDOR_OUT
+from .crazyradio_packets import FIRST_FIRMWARE, GET_SNIFFER_DROP_COUNT, SET_RADIO_MODE, SNIFFER, VENDOR_IN, VENDOR_OUT
 
 LIST, CLAIM, REQUEST, PACKET, READ, DROPPED = range(6)
 VENDOR = 0x1915
@@ -53,10 +53,10 @@ class SimulatedDongle:
             connection.send(bytes((CLAIM, self._number)))
             free = connection.recv(1) == b"\x01"
         except OSError as error:
-            raise usb.core.USBError("the simulated radio has gone", None, errno.ENODEV) from error
+            raise _error("the simulated radio has gone", errno.ENODEV) from error
         if not free:
             connection.close()
-            raise usb.core.USBError("the dongle is in use", None, errno.EBUSY)
+            raise _error("the dongle is in use", errno.EBUSY)
         self._socket = connection
 
     def dispose(self, device: Any = None) -> None:
@@ -89,14 +89,14 @@ class SimulatedDongle:
         if kind == VENDOR_OUT:
             if request == SET_RADIO_MODE:
                 if wValue > SNIFFER or self.bcdDevice < FIRST_FIRMWARE:
-                    raise usb.core.USBError("Pipe error", None, errno.EPIPE)
+                    raise _error("Pipe error", errno.EPIPE)
                 self._sniffs = wValue == SNIFFER
             self._send(struct.pack("<BBHH", REQUEST, request, wValue, wIndex) + bytes(data_or_wLength or ()))
             return 0
         if kind == VENDOR_IN and request == GET_SNIFFER_DROP_COUNT and self._sniffs:
             self._send(bytes((DROPPED,)))
             return array("B", self._await(DROPPED, timeout))
-        raise usb.core.USBError("not supported", None, errno.EPIPE)
+        raise _error("not supported", errno.EPIPE)
 
     def _send(self, message: bytes) -> None:
         self.managed_claim_interface(self, 0)
@@ -107,11 +107,11 @@ class SimulatedDongle:
             raise self._disconnected() from error
 
     def _receive(self, timeout_ms: int | None) -> bytes:
-        if self._socket is None:
-            raise self._disconnected()
+        data = b""
         try:
-            self._socket.settimeout(timeout_ms / 1000 if timeout_ms else None)
-            data = self._socket.recv(128)
+            if self._socket is not None:
+                self._socket.settimeout(timeout_ms / 1000 if timeout_ms else None)
+                data = self._socket.recv(128)
         except TimeoutError as error:
             raise usb.core.USBTimeoutError("no answer", None, errno.ETIMEDOUT) from error
         except OSError as error:
@@ -132,7 +132,11 @@ class SimulatedDongle:
     def _disconnected(self) -> usb.core.USBError:
         self.dispose()
         time.sleep(GONE_S)
-        return usb.core.USBError("the simulated radio has gone", None, errno.ENODEV)
+        return _error("the simulated radio has gone", errno.ENODEV)
+
+
+def _error(text: str, number: int) -> usb.core.USBError:
+    return usb.core.USBError(text, None, number)
 
 
 def _connect(path: Path) -> socket.socket:

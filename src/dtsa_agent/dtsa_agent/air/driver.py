@@ -24,12 +24,11 @@ from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.priority import realtime_thread, wake_precisely
 from dtsa_agent.stop import Stop
 
-from .port import ClockMap, DatagramPort, check_fits, lateness_ns, link_of
-from .record import AgentCounts, ReceivedFrame, SlotRecord, Watcher
-from .reports import Reports
+from .port import ClockMap, Port, check_fits, link_of
+from .record import AgentCounts, ReceivedFrame, Reports, SlotRecord, Watcher
 from .settings import AgentSettings
 
-_SECOND = 1_000_000_000
+_SECOND, _NEVER = 1_000_000_000, 1 << 62  # ns
 _SIGNAL_POLL_S = 0.05  # a signal is noticed after this time at the latest
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
 _STATUS_NS = 100_000_000  # from one check of the station's status to the next
@@ -65,7 +64,7 @@ class LiveAgent:
     """
 
     def __init__(
-        self, own: AgentSettings, config: SwarmConfig, port: DatagramPort, watcher: Watcher | None = None,
+        self, own: AgentSettings, config: SwarmConfig, port: Port, watcher: Watcher | None = None,
         vehicle: AgentVehicle | None = None, log: Callable[[str], None] | None = None,
         show: Callable[[str], None] | None = None,
     ) -> None:  # fmt: skip
@@ -95,11 +94,11 @@ class LiveAgent:
         self._signals = 0
 
     def _start(self) -> Station:
-        now, senses = self.clock.local_ns(time.monotonic_ns()), type(self._vehicle).sense is not AgentVehicle.sense
-        sense = (lambda slot: self._vehicle.sense(self.swarm)) if senses else None
-        return Station(
-            self.swarm, self._settings, now, sense, self, every_frame=bool(self.watcher or self._header is not None)
-        )
+        vehicle, every_frame = self._vehicle, bool(self.watcher or self._header is not None)
+        senses = type(vehicle).sense is not AgentVehicle.sense
+        sense = (lambda slot: vehicle.sense(self.swarm)) if senses else None
+        now = self.clock.local_ns(time.monotonic_ns())
+        return Station(self.swarm, self._settings, now, sense, self, every_frame)
 
     # The loop.
 
@@ -114,17 +113,17 @@ class LiveAgent:
 
     def _run(self, stop: Stop) -> None:
         began = self.counts.began_ns = time.monotonic_ns()
-        end = began + round(self.own.duration_s * _SECOND) if self.own.duration_s else None
+        end = began + round(self.own.duration_s * _SECOND) if self.own.duration_s else _NEVER
         while not self._vehicle.is_ready():
             now = time.monotonic_ns()
             self._reports.state("waits for the vehicle's odometry", now)
-            if stop or (end is not None and now >= end):
+            if stop or now >= end:
                 return
             time.sleep(_SIGNAL_POLL_S)
         station = self.station = self._start()
         clock, port, step, now = self.clock, self.port, station.step, began
         local, deliver, descriptor = clock.local_ns, port.deliver, [port.fileno()]
-        while not ((stop.signal or (end is not None and now >= end)) and self._has_ended(stop, end)):
+        while not ((stop.signal or now >= end) and self._has_ended(stop)):
             count = deliver(station, clock, _BURST)
             due = shown = -1
             while due <= shown:
@@ -148,11 +147,9 @@ class LiveAgent:
                 time.sleep(left)
         self._close_record()
 
-    def _has_ended(self, stop: Stop, end: int | None) -> bool:
+    def _has_ended(self, stop: Stop) -> bool:
         """Whether to end now: after a second signal, when it has announced that it leaves, or has no time left to."""
         now = time.monotonic_ns()
-        if not stop and (end is None or now < end):
-            return False
         if self._leaves_by is None:
             if not self.config.policy_row.says_leaving or self.slot < 0:
                 return True
@@ -193,7 +190,6 @@ class LiveAgent:
     # Events of the station.
 
     def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
-        """Record the decision for a slot."""
         self._close_record()
         if self.watcher is None:
             return
@@ -205,23 +201,20 @@ class LiveAgent:
         )  # fmt: skip
 
     def restarted(self, slot: int) -> None:
-        """The agent restarts with the next slot."""
         self._close_record()
         self._before.clear()
         self.slot = slot
         self.counts.add_start(slot + 1)
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
-        """Count and record a frame."""
         if accepted and self._header is not None:
-            start, late = self.station.slot_start_ns(slot), lateness_ns(datagram, self._header)
+            start, late = self.station.slot_start_ns(slot), self._header.late_ns(datagram)
             self.counts.add_arrival(arrival_ns - start - self._flight_ns - late)
         if self.watcher is not None:
             frame = ReceivedFrame(sender, slot, arrival_ns, datagram, accepted)
             (self._before if self._record is None else self._record.heard).append(frame)
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
-        """Count and record a datagram that was not accepted."""
         self.counts.refused[fault] += 1
         self._reports.foreign(fault, time.monotonic_ns())
         if self.watcher is not None:

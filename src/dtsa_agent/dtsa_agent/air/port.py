@@ -19,10 +19,11 @@ the frame is. Times are integer ns, CLOCK_MONOTONIC unless said otherwise.
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
@@ -33,21 +34,15 @@ _SECOND = 1_000_000_000
 _MAGIC = b"DT\x01\x00"
 _WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic
 _TRUST_NS = 1_000_000
-_UNIT_NS = 10_000  # of times in the header
 
 
+@dataclass(frozen=True, slots=True)
 class ClockMap:
-    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift.
+    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift."""
 
-    :param offset_ns: by how much it is ahead at ``began_ns``; None: now.
-    :param drift_ppb: parts per billion by which it runs fast.
-    """
-
-    __slots__ = ("began_ns", "drift_ppb", "offset_ns")
-
-    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0, began_ns: int | None = None) -> None:
-        self.began_ns = time.monotonic_ns() if began_ns is None else began_ns
-        self.offset_ns, self.drift_ppb = offset_ns, drift_ppb
+    offset_ns: int = 0  # by how much it is ahead at `began_ns`
+    drift_ppb: int = 0  # parts per billion by which it runs fast
+    began_ns: int = field(default_factory=time.monotonic_ns)
 
     def local_ns(self, monotonic_ns: int) -> int:
         """What the clock shows at a time of CLOCK_MONOTONIC."""
@@ -71,6 +66,10 @@ class Header(NamedTuple):
         """Bytes before the frame."""
         return sum(self)
 
+    def late_ns(self, datagram: bytes) -> int:
+        """How much later than its slot a datagram says to have left; 0 where it does not say."""
+        return int.from_bytes(datagram[self.agreed : self.agreed + self.late], "little") * 10_000
+
 
 @dataclass(frozen=True, slots=True)
 class PortProperties:
@@ -86,7 +85,7 @@ class PortProperties:
     shortest_slot_ns: int = 0  # shorter slots are refused
     turn_ns: int = 0  # of radios that take turns by themselves, how long one of them has its turn
     slots_hold_flights: bool = False  # slots in which a frame may arrive too late for the next one are refused
-    varies: bool = False  # frames arrive by milliseconds earlier or later than others: see `trust_ns`
+    varies: bool = False  # frames arrive by milliseconds earlier or later than others
 
     def header(self, signed: bool) -> Header:
         """What stands before a frame, which carries a tag if it is signed."""
@@ -101,84 +100,89 @@ class ReceivedDatagram(NamedTuple):
     own: bool  # this very port has sent it
 
 
-class Listener(Protocol):
-    """What hears the datagrams of a swarm. A context manager."""
+P = TypeVar("P", bound="Port")
 
-    log: Callable[[str], None] | None  # prints a line when the port fails or is back; its user sets it
 
+class Port(ABC):
+    """What carries the datagrams of an agent with a clock of its own, or brings them to a listener. A context manager.
+
+    What it sends may come back to it, marked as its own.
+    """
+
+    properties: PortProperties
+    log: Callable[[str], None] | None = None  # prints a line when the port fails or is back; its user sets it
+    name: str  # begins these lines
+
+    @abstractmethod
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
 
-    def receive(self, most: int) -> list[ReceivedDatagram]:
-        """Return what has arrived, at most so many datagrams, in this order; empty if nothing has."""
-
-    def counts(self) -> dict[str, int]:
-        """Return what it counts, by name, for the summary."""
-
-    def __enter__(self) -> Listener: ...
-
-    def __exit__(self, *unused: object) -> None: ...
-
-
-class DatagramPort(Listener, Protocol):
-    """What an agent with a clock of its own asks of the port that carries its datagrams."""
-
-    properties: PortProperties
-
+    @abstractmethod
     def send(self, data: bytes) -> str:
         """Send a datagram at once; return why the port has refused it, or an empty text."""
 
+    @abstractmethod
+    def receive(self, most: int) -> list[ReceivedDatagram]:
+        """Return what has arrived, at most so many datagrams, in this order; empty if nothing has."""
+
+    @abstractmethod
+    def counts(self) -> dict[str, int]:
+        """Return what it counts, by name, for the summary."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free it for others."""
+
     def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
         """Hand what others have sent to a station; return how many datagrams have arrived, at most so many."""
+        datagrams = self.receive(most)
+        for datagram in datagrams:
+            if not datagram.own:
+                station.receive(datagram.data, clock.local_ns(datagram.arrival_ns))
+        return len(datagrams)
 
-    def __enter__(self) -> DatagramPort: ...
+    def print(self, text: str) -> None:
+        """Print a line about the port."""
+        if self.log is not None:
+            self.log(f"{self.name} {text}")
+
+    def __enter__(self: P) -> P:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.close()
 
 
 class PortSettings(Protocol):
     """The settings of a kind of port."""
 
     @property
-    def properties(self) -> PortProperties:
-        """What agents, listeners and bags must know of it."""
+    def properties(self) -> PortProperties: ...
 
     @property
     def destination(self) -> str:
-        """Destination of the frames, for logs."""
+        """Where frames go, for logs."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """The settings as plain values."""
+    def to_dict(self) -> dict[str, Any]: ...
 
 
-#: Kinds of port by name, which `--air NAME` and the parameter ``air`` of a node choose from: module, port, settings.
-_PORTS = {
-    "udp": ("udp_port", "UdpPort", "UdpSettings"),
-    "crazyradio": ("crazyradio_port", "CrazyradioPort", "CrazyradioSettings"),
-    "serial": ("serial_port", "SerialPort", "SerialSettings"),
-}
-AIRS = tuple(_PORTS)
+#: Kinds of port, which `--air NAME` and the parameter ``air`` of a node choose from; they name modules and classes.
+AIRS = ("udp", "crazyradio", "serial")
 
 
 def settings_class(air: str) -> Any:
-    """Return the settings class of a kind of port; its objects are :class:`PortSettings`.
-
-    :raises ConfigError: if there is none of this name.
-    """
-    if air not in _PORTS:
+    """Return the settings class of a kind of port; ConfigError: there is none of this name."""
+    if air not in AIRS:
         raise ConfigError("air", air, ", ".join(AIRS))
-    return getattr(import_module("dtsa_agent.air.settings"), _PORTS[air][2])
+    return getattr(import_module("dtsa_agent.air.settings"), f"{air.capitalize()}Settings")
 
 
-def open_port(settings: PortSettings) -> DatagramPort:
-    """Return the port of an agent, or of a listener; only its module is imported.
-
-    :raises ConfigError: if it cannot be used.
-    """
-    module, cls, _ = _PORTS[settings.properties.name]
-    port: DatagramPort = getattr(import_module(f"dtsa_agent.air.{module}"), cls)(settings)
+def open_port(settings: PortSettings) -> Port:
+    """Return the port of an agent, or of a listener; only its module is imported. ConfigError: it cannot be used."""
+    air = settings.properties.name
+    port: Port = getattr(import_module(f"dtsa_agent.air.{air}_port"), f"{air.capitalize()}Port")(settings)
     return port
 
-
-# The datagram.
 
 NETWORK = PortProperties("udp")  # with the longest header
 HEADER = NETWORK.header(signed=True).size  # bytes before the frame
@@ -188,16 +192,6 @@ def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
     """From the order to send a frame to its arrival, as agents take it to be, ns."""
     length = port.header(config.auth).size + config.frame_length
     return port.flight_time_ns + port.byte_time_ns * length + port.turn_ns * config.agents // 2  # half a round
-
-
-def lateness_ns(datagram: bytes, header: Header) -> int:
-    """How much later than its slot a datagram says to have left; 0 where it does not say."""
-    return int.from_bytes(datagram[header.agreed : header.agreed + header.late], "little") * _UNIT_NS
-
-
-def trust_ns(config: SwarmConfig, port: PortProperties) -> int:
-    """By how much a frame may be off its slot and still say what time it is."""
-    return config.slot_ns // 4 if port.varies else _TRUST_NS
 
 
 def shortest_slot_ns(config: SwarmConfig, port: PortProperties) -> int:
@@ -218,19 +212,24 @@ def check_fits(config: SwarmConfig, port: PortProperties) -> None:
     """
     shortest_ns = shortest_slot_ns(config, port)
     if config.slot_ns < shortest_ns:
-        allowed = f"at least {-(-shortest_ns // 100_000) / 10:g} over {port.name}"
+        allowed = f"at least {_tenths_ms(shortest_ns)} over {port.name}"
         if port.slots_hold_flights:
             allowed += f" with frames of {config.frame_length} bytes"
         if port.slots_hold_flights and config.extended:
             plain = next(row.name for row in POLICIES.rows.values() if not row.extended)
             short = replace(config, frame="paper", policy=plain if config.policy_row.extended else config.policy)
-            less_ms = -(-shortest_slot_ns(short, port) // 100_000) / 10
-            allowed += f", {less_ms:g} with {short.frame_length} (policy {short.policy}, frame paper)"
+            less = _tenths_ms(shortest_slot_ns(short, port))
+            allowed += f", {less} with {short.frame_length} (policy {short.policy}, frame paper)"
         raise ConfigError("slot_ms", config.slot_ms, allowed)
     room = port.longest - port.header(config.auth).size
     if config.frame_length > room:
         by = f"policy {config.policy}, frame {config.frame}{', sealed' if config.auth else ''}"
         raise ConfigError("frame", f"{config.frame_length} bytes ({by})", f"at most {room} bytes over {port.name}")
+
+
+def _tenths_ms(ns: int) -> str:
+    """A time as ms, rounded up to tenths."""
+    return f"{-(-ns // 100_000) / 10:g}"
 
 
 def header_of(config: SwarmConfig, port: PortProperties = NETWORK) -> bytes:
@@ -243,6 +242,5 @@ def header_of(config: SwarmConfig, port: PortProperties = NETWORK) -> bytes:
 def link_of(config: SwarmConfig, port: PortProperties = NETWORK) -> Link:
     """What carries the datagrams of a swarm, for its stations."""
     header = port.header(config.auth)
-    return Link(
-        header_of(config, port), header.late > 0, header.peers // 4, flight_ns(config, port), trust_ns(config, port)
-    )
+    trust_ns = config.slot_ns // 4 if port.varies else _TRUST_NS  # frames that are off by more do not say the time
+    return Link(header_of(config, port), header.late > 0, header.peers // 4, flight_ns(config, port), trust_ns)

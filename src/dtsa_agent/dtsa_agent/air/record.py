@@ -1,19 +1,28 @@
-"""What a live agent did: one record a slot, for a recorder, and counts of bounded size, for its summary."""
+"""What a live agent did and prints: a record a slot, counts of bounded size for its summary, and lines in flight."""
 
 from __future__ import annotations
 
 import resource
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from dtsa_agent.core.delays import Delays
-from dtsa_agent.core.station import STATES
+from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, OTHER_SETTINGS, REJECTED, SAME_ID, STATES
 from dtsa_agent.core.swarm import Floats
 
+_SECOND = 1_000_000_000
 _ON_TIME_NS = 1_000_000
 TOO_LATE = "too late"  # an own frame that would have disturbed the next turn
+_STATE_NS = _SECOND  # a state that lasts is reported after this time, and the next one not before twice that
+_FOREIGN_NS = 30 * _SECOND  # from a line about foreign datagrams to the next
+_TIMED_FRAMES, _OFF_SHARE = 100, 0.05  # frames off their slots: of so many, so large a share means too short slots
+_FOREIGN = {
+    OTHER_SETTINGS: "other settings: slot length, agents, policy, seed, session or another one that all must share",
+    REJECTED: "another key, or frames played again",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +82,7 @@ class AgentCounts:
         self.flew = False
         self._joined_s = 0.0  # processor time until then
         self._others = self._hears = 0  # agents that are present, and those heard of them, over all checks
-        self._late = Delays()  # frames sent, by how late they left
-        self._off: Delays | None = None  # frames heard, by how far off they arrived
+        self._late, self._off = Delays(), Delays()  # frames sent, by how late they left; heard, by how far off
         self._on_time = 0
 
     def add_start(self, slot: int) -> None:
@@ -94,7 +102,6 @@ class AgentCounts:
 
     def add_arrival(self, off_ns: int) -> None:
         """A frame arrived so much earlier or later than expected, over a port whose arrivals vary."""
-        self._off = self._off or Delays()
         self._off.add(abs(off_ns))
 
     def summary(self, status: Any, longest_gap: tuple[int, int]) -> dict[str, Any]:
@@ -113,7 +120,7 @@ class AgentCounts:
             "sends_on_time_share": self._on_time / status.sent if status.sent else None,
             "send_late_ms": _quantiles(self._late),
             "heard": status.heard,
-            **({} if self._off is None else {"arrivals_off_ms": _quantiles(self._off)}),
+            **({"arrivals_off_ms": _quantiles(self._off)} if self._off.count() else {}),
             "heard_share": self._hears / self._others if self._others else None,
             "oldest_heard_slots": longest_gap[0] if self._others else None,
             "oldest_heard_of": longest_gap[1] or None,
@@ -136,7 +143,6 @@ def _quantiles(delays: Delays) -> dict[str, float | None]:
 
 
 def _processor_s() -> float:
-    """Processor time of this process so far, s."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
@@ -148,3 +154,92 @@ def _memory_mb() -> float:
             return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
     except (OSError, StopIteration):
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+class Reports:
+    """The lines of one agent: one when its state changes, and one for each fault that lasts. Times: CLOCK_MONOTONIC.
+
+    :param log: prints a line; None: nothing is printed.
+    :param show: shows a line in place of the one before, once a second; None: nothing is shown.
+    """
+
+    def __init__(
+        self, id: int, slot_ms: float, log: Callable[[str], None] | None, now_ns: int,
+        show: Callable[[str], None] | None = None,
+    ) -> None:  # fmt: skip
+        self._id, self._slot_ms, self._log, self._show = id, slot_ms, log or (lambda line: None), show
+        self._show_due_ns = now_ns
+        self._state = self._printed = ""  # the present state, and the one that was printed last
+        self._state_due_ns = now_ns + _STATE_NS
+        self._foreign: Counter[str] = Counter()
+        self._foreign_due_ns = self._foreign_next_ns = 0
+        self._outage_ns = self._outage_count = 0  # since when no frame leaves; 0: they do
+        self._outage_printed = False
+        self._timed = (-1, 0)  # frames of about the own time so far, of these off their slots
+        self.slots_too_short = False
+
+    def state(self, text: str, now_ns: int) -> None:
+        """Report a state once it has lasted; what follows a colon may change without another line."""
+        state = text.partition(":")[0]
+        if state != self._state:
+            self._state, self._state_due_ns = state, max(self._state_due_ns, now_ns + _STATE_NS)
+        if state != self._printed and now_ns >= self._state_due_ns:
+            self._printed, self._state_due_ns = state, now_ns + 2 * _STATE_NS
+            self._log(text)
+
+    def status(self, status: Any, now_ns: int) -> None:
+        """Report the state in a ``dtsa_station_status`` with slots."""
+        contact = f"hears {status.hears} of {status.others}, is heard by {status.heard_by} (quorum {status.needed})"
+        text = {
+            FLIES: f"flies: {contact}", SAME_ID: f"hovers: another agent sends as {self._id}",
+            NO_QUORUM: f"hovers: {contact}", IS_NEW: f"is new, and hovers until the others know it: {contact}",
+        }[status.hovers]  # fmt: skip
+        if status.hovers != FLIES and STATES[status.state] == "alone":
+            text = "is alone, and hovers until it hears others"
+        self.state(text, now_ns)
+        if self._show is not None and now_ns >= self._show_due_ns:
+            self._show_due_ns = now_ns + _SECOND
+            self._show(f"slot {status.slot}, {status.sent} sent, {status.heard} heard; {text}")
+        self._check_slot_length(status.timed, status.off)
+        if self._foreign_due_ns and now_ns >= self._foreign_due_ns:
+            counts = "; ".join(f"{count} of {_FOREIGN[why]}" for why, count in sorted(self._foreign.items()))
+            self._log(f"datagrams not taken in so far: {counts}")
+            self._foreign_due_ns, self._foreign_next_ns = 0, now_ns + _FOREIGN_NS
+
+    def _check_slot_length(self, timed: int, off: int) -> None:
+        """Report slots that are too short, by how many of the frames heard were off by more than a quarter of one."""
+        before, off_before = self._timed
+        count = timed - max(before, 0)
+        if count < _TIMED_FRAMES:
+            return
+        self._timed = timed, off
+        share = (off - off_before) / count
+        # The first ones may be of agents that are about to adopt the time of this one.
+        if before >= 0 and share > _OFF_SHARE and not self.slots_too_short:
+            self.slots_too_short = True
+            self._log(
+                f"slots of {self._slot_ms:g} ms are too short for this network: {share:.0%} of the last {count} frames"
+                " were off by more than a quarter of a slot"
+            )
+
+    def foreign(self, fault: str, now_ns: int) -> None:
+        """Note a datagram that was not accepted: one of other settings or another key is worth a line."""
+        if fault in _FOREIGN:
+            self._foreign[fault] += 1
+            self._foreign_due_ns = self._foreign_due_ns or max(now_ns + _SECOND, self._foreign_next_ns)
+
+    def sent(self, refusal: str, now_ns: int) -> None:
+        """Note a frame, and why the port has refused it; a queue that is full for a moment is worth no line."""
+        if not refusal and not self._outage_count:
+            return
+        self._outage_ns = self._outage_ns or now_ns
+        lasted = f"{(now_ns - self._outage_ns) / 1e9:.1f} s"
+        if refusal:
+            self._outage_count += 1
+            if not self._outage_printed and now_ns - self._outage_ns >= _SECOND:
+                self._outage_printed = True
+                self._log(f"no frame has left for {lasted}: {refusal}")
+        else:
+            if self._outage_printed:
+                self._log(f"frames leave again; for {lasted} none did, {self._outage_count} were refused")
+            self._outage_ns, self._outage_count, self._outage_printed = 0, 0, False

@@ -39,15 +39,13 @@ def _bits(bitrate: int, overhead_bytes: int, fixed_ns: int = 0) -> Callable[[int
     return lambda length: fixed_ns - (-(overhead_bytes + length) * 8 * _SECOND // bitrate)
 
 
-def lora_ns(length: int, *, spreading: int, bandwidth_hz: int, coding: int = 1, preamble: int = 0) -> int:
-    """Time of a LoRa packet on the air, ns: Semtech's formula, with explicit header and check sum.
+def lora_ns(length: int, *, spreading: int, bandwidth_hz: int) -> int:
+    """Time of a LoRa packet on the air, ns (SX1261/2 data sheet, 6.1.4), with explicit header and check sum.
 
-    Source: SX1261/2 data sheet, 6.1.4 (LoRa time on air). ``length`` is in bytes, ``spreading`` the factor of 5 to 12;
-    of each four bits ``coding`` more are sent, 1 to 4. ``preamble`` is in symbols; 0: as the data sheet recommends, 12
-    for spreading factors 5 and 6, else 8.
+    ``length`` is in bytes, ``spreading`` the factor of 5 to 12.
     """
-    few = spreading < 7
-    preamble = preamble or (12 if few else 8)
+    few, coding = spreading < 7, 1  # of each four bits one more is sent
+    preamble = 12 if few else 8  # symbols, as the data sheet recommends
     symbol_ns = (1 << spreading) * _SECOND // bandwidth_hz
     slow = symbol_ns > 16_380_000  # symbols so long are sent with two bits fewer each
     bits = 8 * length + 16 + 20 - 4 * spreading + (0 if few else 8)
@@ -57,35 +55,25 @@ def lora_ns(length: int, *, spreading: int, bandwidth_hz: int, coding: int = 1, 
 
 
 def _e22(spreading: int, rate: str, bitrate: int) -> Modem:
-    """An EBYTE module by its spreading factor at 500 kHz."""
     own = 4  # bytes of the module's own header
     return Modem(
         f"EBYTE E22 and the like, LoRa at {rate}",
         "Semtech SX1261/2 data sheet; EBYTE E22-400T30S manual (packet 240 bytes, buffer 1000 bytes). Assumed:"
         f" spreading factors 5, 6 and 7 at 500 kHz give these rates; {own} bytes of its own; 3 ms until it sends",
         lambda length: lora_ns(own + length, spreading=spreading, bandwidth_hz=500_000),
-        bitrate,
-        turn_round_ns=3 * _MS,
-        gap_bytes=3,
-        packet=240,
-        baud=115_200,
-    )
+        bitrate, turn_round_ns=3 * _MS, gap_bytes=3, packet=240, baud=115_200,
+    )  # fmt: skip
 
 
 def _sik(rate: int) -> Modem:
-    """A SiK radio in multipoint mode by its air speed."""
     on_air_ns = _bits(rate, 13 + 4, 208_000)  # every packet has a trailer, an empty one too
     return Modem(
         f"SiK, RFD900 in multipoint mode at {rate // 1000} kbit/s",
         "SiK tdm.c (13 bytes, a trailer of 4 and 0.2 ms around a packet, 248 bytes, turns); RFD900x multipoint manual"
         " (57600 baud, broadcast). Assumed: in each round every modem without data sends one empty packet; a frame goes"
         " as one packet; the buffer",
-        on_air_ns,
-        rate,
-        turn_ns=on_air_ns(0),
-        packet=248,
-        buffer=2048,
-    )
+        on_air_ns, rate, turn_ns=on_air_ns(0), packet=248, buffer=2048,
+    )  # fmt: skip
 
 
 #: Modems by the name that ``--modem`` gives them.
@@ -101,23 +89,12 @@ MODEMS: dict[str, Modem] = {
         "XBee 802.15.4, transparent broadcast",
         "IEEE 802.15.4 at 2.4 GHz (6 bytes before a packet, 11 around data, CSMA); Digi XBee 802.15.4 manual"
         " (100 bytes, sends after 3 bytes' time, buffer 202 bytes). Assumed: 2 bytes of its own; the mean back-off",
-        _bits(250_000, 6 + 11 + 2),
-        250_000,
-        turn_round_ns=1_440_000,
-        gap_bytes=3,
-        packet=100,
-        buffer=202,
-        baud=115_200,
+        _bits(250_000, 6 + 11 + 2), 250_000, turn_round_ns=1_440_000, gap_bytes=3, packet=100, buffer=202, baud=115_200,
     ),
     "esp-now": Modem(
         "a bridge to ESP-NOW on an ESP32",
         "ESP-IDF, ESP-NOW (1 Mbit/s, 250 bytes, 43 bytes around data); IEEE 802.11b (long preamble, 192 us). Assumed: a"
         " bridge that sends after 3 bytes' time; the mean back-off",
-        _bits(1_000_000, 43, 192_000),
-        1_000_000,
-        turn_round_ns=360_000,
-        gap_bytes=3,
-        packet=250,
-        baud=115_200,
+        _bits(1_000_000, 43, 192_000), 1_000_000, turn_round_ns=360_000, gap_bytes=3, packet=250, baud=115_200,
     ),
 }  # fmt: skip

@@ -1,7 +1,12 @@
-"""Settings of a live agent that its swarm need not share, and of the ports that carry its datagrams."""
+"""Settings of a live agent that its swarm need not share, and of the ports that carry its datagrams.
+
+Each class is validated at creation: ConfigError names the field, the value and what is allowed.
+"""
 
 from __future__ import annotations
 
+import ipaddress
+import re
 import socket
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,7 +20,6 @@ from .port import PortProperties
 from .serial_modems import LONGEST, MODEMS, NONE, OVERHEAD
 
 _SECOND = 1_000_000_000
-# A class below is validated at creation: ConfigError names the field, the value and what is allowed.
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +69,10 @@ class UdpSettings(Settings):
 
     @property
     def properties(self) -> PortProperties:
-        """What agents, listeners and bags must know of it."""
         return PortProperties("udp", self.flight_time_ns, self.byte_time_ns)
 
     @property
     def destination(self) -> str:
-        """Destination of the frames, for logs."""
         return f"{self.group} on {self.interface}"
 
     @property
@@ -79,10 +81,7 @@ class UdpSettings(Settings):
         return _parse_group(self.group)
 
     def interface_index(self) -> int:
-        """Return the number that the kernel gives the interface.
-
-        :raises ConfigError: if there is no such interface.
-        """
+        """Return the number that the kernel gives the interface; ConfigError: there is none of this name."""
         try:
             return socket.if_nametoindex(self.interface)
         except (OSError, ValueError):
@@ -91,20 +90,20 @@ class UdpSettings(Settings):
 
 
 def _parse_group(text: object) -> tuple[str, int]:
-    host, colon, port = str(text).rpartition(":")
+    parts = re.fullmatch(r"([0-9.]+):([0-9]{1,5})", str(text))
     try:
-        first, *_ = socket.inet_pton(socket.AF_INET, host)
-    except (OSError, ValueError):
-        raise ConfigError("group", text, _GROUP) from None
-    if not (colon and port.isascii() and port.isdigit() and 0 < int(port) < 65536 and first >> 4 == 14):
-        raise ConfigError("group", text, f"{_GROUP}: 224.0.0.0 to 239.255.255.255, port 1 to 65535")
-    return host, int(port)
+        if parts and ipaddress.IPv4Address(parts[1]).is_multicast and 0 < int(parts[2]) < 65536:
+            return parts[1], int(parts[2])
+    except ValueError:  # no address
+        pass
+    raise ConfigError("group", text, f"{_GROUP}: 224.0.0.0 to 239.255.255.255, port 1 to 65535")
 
 
-_URI = "radio://RADIO/CHANNEL/RATE, as radio://0/80/2M"
 _RADIO_BITS = 73 + 8 * 2  # on air beside the data: preamble, address, control, checksum; the header of peer-to-peer
 _RATES_MBPS = {"1M": 1, "2M": 2}  # a Crazyradio 2.0 has no 250K
 _HIGHEST_CHANNEL = 100
+_URI = "radio://RADIO/CHANNEL/RATE, as radio://0/80/2M"
+_URI_ALLOWED = f"{_URI}: channel 0 to {_HIGHEST_CHANNEL}, rate {' or '.join(_RATES_MBPS)}"
 _LONGEST_BROADCAST = 60  # bytes between Crazyflies
 _SHORTEST_RADIO_SLOT_NS = 10_000_000  # when a frame leaves is known to 1 ms; for one more its sender is deaf
 
@@ -130,16 +129,18 @@ class CrazyradioSettings(Settings):
 
     def __post_init__(self) -> None:
         check(self)
-        _parse_uri(self.uri)
+        _ = self.address
 
     @property
     def address(self) -> DongleAddress:
         """Dongle, channel and rate."""
-        return _parse_uri(self.uri)
+        parts = re.fullmatch(r"radio://([0-9A-Za-z]+)/([0-9]{1,3})/(\w+)", str(self.uri))
+        if parts is None or int(parts[2]) > _HIGHEST_CHANNEL or parts[3] not in _RATES_MBPS:
+            raise ConfigError("uri", self.uri, _URI_ALLOWED)
+        return DongleAddress(parts[1], int(parts[2]), _RATES_MBPS[parts[3]])
 
     @property
     def properties(self) -> PortProperties:
-        """What agents, listeners and bags must know of it."""
         bit_ns = 1_000 // self.address.rate_mbps
         return PortProperties(
             "crazyradio", self.send_time_ns + _RADIO_BITS * bit_ns, 8 * bit_ns, agreed_bytes=2, peers=0,
@@ -148,20 +149,7 @@ class CrazyradioSettings(Settings):
 
     @property
     def destination(self) -> str:
-        """Destination of the frames, for logs."""
         return f"{self.uri}, P2P port {self.p2p_port}"
-
-
-def _parse_uri(uri: object) -> DongleAddress:
-    words = str(uri).removeprefix("radio://").split("/")
-    if not str(uri).startswith("radio://") or len(words) != 3 or not (words[0].isascii() and words[0].isalnum()):
-        raise ConfigError("uri", uri, _URI)
-    radio, channel, rate = words
-    if not (channel.isascii() and channel.isdigit() and len(channel) < 4 and int(channel) <= _HIGHEST_CHANNEL):
-        raise ConfigError("uri", uri, f"{_URI}: channel 0 to {_HIGHEST_CHANNEL}")
-    if rate not in _RATES_MBPS:
-        raise ConfigError("uri", uri, f"{_URI}: rate {' or '.join(_RATES_MBPS)}")
-    return DongleAddress(radio, int(channel), _RATES_MBPS[rate])
 
 
 _LINE_BITS = 10  # of a byte on the line
@@ -195,7 +183,6 @@ class SerialSettings(Settings):
 
     @property
     def properties(self) -> PortProperties:
-        """What agents, listeners and bags must know of it."""
         modem, line_ns = MODEMS[self.modem], self.line_byte_ns
         byte_ns = (modem.on_air_ns(_LONG) - modem.on_air_ns(_SHORT)) // (_LONG - _SHORT)
         modem_ns = modem.turn_round_ns + modem.on_air_ns(_SHORT) - byte_ns * _SHORT
@@ -211,5 +198,4 @@ class SerialSettings(Settings):
 
     @property
     def destination(self) -> str:
-        """Destination of the frames, for logs."""
         return f"{self.device} at {self.baud} baud, modem {self.modem}"

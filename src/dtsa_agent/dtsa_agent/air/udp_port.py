@@ -6,7 +6,6 @@ import fcntl
 import socket
 import struct
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.station import Station
 
-from .port import ClockMap, ReceivedDatagram
+from .port import ClockMap, Port, ReceivedDatagram
 from .settings import UdpSettings
 
 _SIOCGIFADDR = 0x8915
@@ -31,8 +30,8 @@ class InterfaceState(NamedTuple):
     address: str  # IPv4
 
 
-class UdpPort:
-    """Sends to a group and hears what others send to it. A context manager.
+class UdpPort(Port):
+    """Sends to a group and hears what others send to it.
 
     Datagrams of other groups and interfaces do not get in. What it sends comes back to it, marked as its own: other
     agents on this computer hear it in the same way. When the interface is made anew, or gets another address, the group
@@ -43,14 +42,12 @@ class UdpPort:
 
     def __init__(self, settings: UdpSettings) -> None:
         self._settings, self._group, self.properties = settings, settings.address, settings.properties
-        group, port = self._group
+        self.name = f"interface {settings.interface}"
         state = _state_of(settings)
-        self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._in, self._out = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
         self._reader = ffi.new("socket_reader *")
         lib.socket_start(self._reader, self._in.fileno())
         self.interface_changes = 0  # how often the group was joined again
-        self.log: Callable[[str], None] | None = None
         self._state: InterfaceState | None = None  # by which the group is joined; None: the interface has gone
         self._membership = b""
         self._check_due_ns = time.monotonic_ns() + _CHECK_NS
@@ -64,8 +61,8 @@ class UdpPort:
             self._join(state)
         except OSError as error:
             self.close()
-            where = f"{settings.interface}, group {group}:{port}"
-            raise ConfigError("interface", where, f"one that takes part in the group ({error.strerror})") from None
+            where, allowed = f"{settings.interface}, group {settings.group}", "one that takes part in the group"
+            raise ConfigError("interface", where, f"{allowed} ({error.strerror})") from None
 
     def _join(self, state: InterfaceState) -> None:
         """Join the group, and send to it, by an interface as it is now."""
@@ -96,7 +93,7 @@ class UdpPort:
             state = _state_of(self._settings)
         except ConfigError:
             if self._state is not None:
-                self._print("has gone, or has no address: no frame leaves or arrives until it is back")
+                self.print("has gone, or has no address: no frame leaves or arrives until it is back")
             self._state = None
             return False
         if state == self._state:
@@ -106,19 +103,13 @@ class UdpPort:
         except OSError:  # it is not ready yet
             return False
         self.interface_changes += 1
-        self._print(f"is another one now (number {state.number}, address {state.address}): joined the group again")
+        self.print(f"is another one now (number {state.number}, address {state.address}): joined the group again")
         return True
 
-    def _print(self, text: str) -> None:
-        if self.log is not None:
-            self.log(f"interface {self._settings.interface} {text}")
-
     def fileno(self) -> int:
-        """For ``select``: readable when something has arrived."""
         return self._in.fileno()
 
     def send(self, data: bytes) -> str:
-        """Send to the group at once; return why the network has refused it, or an empty text."""
         refusal = self._send(data)
         return self._send(data) if refusal and self.check_interface() else refusal
 
@@ -130,13 +121,11 @@ class UdpPort:
         return ""
 
     def receive(self, most: int) -> list[ReceivedDatagram]:
-        """Return what has arrived, in this order; empty if nothing has."""
         self._check_in_time()
         datagrams = (self._reader.datagrams[k] for k in range(lib.socket_read(self._reader, most)))
         return [ReceivedDatagram(bytes(ffi.buffer(d.data, d.length)), d.arrival_ns, bool(d.own)) for d in datagrams]
 
     def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
-        """Hand what others have sent to a station; return how many datagrams have arrived, at most so many."""
         self._check_in_time()
         count: int = lib.socket_deliver(self._reader, most, station.c, clock.offset_ns, clock.drift_ppb, clock.began_ns)
         station.raise_fault()
@@ -149,7 +138,6 @@ class UdpPort:
             self.check_interface()
 
     def counts(self) -> dict[str, int]:
-        """Return failed reads, how often the clock has been set, and how often the interface was another one."""
         return {
             "unreadable": self._reader.unreadable,
             "clock_steps": self._reader.clock_steps,
@@ -157,15 +145,8 @@ class UdpPort:
         }
 
     def close(self) -> None:
-        """Leave the group."""
         self._in.close()
         self._out.close()
-
-    def __enter__(self) -> UdpPort:
-        return self
-
-    def __exit__(self, *unused: object) -> None:
-        self.close()
 
 
 def _state_of(settings: UdpSettings) -> InterfaceState:

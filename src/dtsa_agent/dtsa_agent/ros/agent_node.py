@@ -24,29 +24,23 @@ CHANNEL = "channel"
 _AIR = Setting("air", "text", CHANNEL, "what carries the frames: the channel's node, or a port", words=(CHANNEL, *AIRS))
 
 
-def _make_node(supervised: bool) -> tuple[Node, int, str]:
-    """Return the node in its agent's namespace, the agent's id (parameter ``id``, or of the namespace), its swarm."""
-    options = node_options(supervised)
-    node = Node("agent", namespace=_UNNAMED, **options)
-    namespace = node.get_namespace()
-    digits = namespace.rpartition("cf")[2]
-    agent = _own_id(node, int(digits) if digits.isdigit() and namespace != _UNNAMED else 1)
-    space = declare_swarm_namespace(node)
-    if namespace == _UNNAMED:
-        node.destroy_node()
-        node = Node("agent", namespace=names.agent_namespace(agent, space), **options)
-        _own_id(node, agent)
-        declare_swarm_namespace(node)
-    return node, agent, space
-
-
-def _own_id(node: Node, default: int) -> int:
+def _declare_identity(node: Node) -> tuple[int, str]:
+    """Declare and return the agent's id, which the namespace may give, and the namespace of its swarm."""
+    digits = node.get_namespace().rpartition("cf")[2]
+    default = int(digits) if digits.isdigit() and node.get_namespace() != _UNNAMED else 1
     text = "id of this agent, 1 .. agents; default: the number in the namespace"
-    return int(declare_setting(node, Setting("id", "int", default, text, minimum=1, maximum=MAX_AGENTS)))
+    agent = declare_setting(node, Setting("id", "int", default, text, minimum=1, maximum=MAX_AGENTS))
+    return int(agent), declare_swarm_namespace(node)
 
 
 def _body(stop: Stop, supervised: bool) -> int | None:
-    node, agent, space = _make_node(supervised)
+    options = node_options(supervised)
+    node = Node("agent", namespace=_UNNAMED, **options)
+    agent, space = _declare_identity(node)
+    if node.get_namespace() == _UNNAMED:
+        node.destroy_node()
+        node = Node("agent", namespace=names.agent_namespace(agent, space), **options)
+        _declare_identity(node)
     with ending(node):
         air = _AIR.check(declare_setting(node, _AIR))
         if air != CHANNEL:
@@ -56,7 +50,7 @@ def _body(stop: Stop, supervised: bool) -> int | None:
         config = declare_swarm(node)
         if agent > config.agents:
             raise ConfigError("id", agent, f"1 to {config.agents}, the number of agents")
-        host_agents(node, [agent], config, stop, space, spaces=[node.get_namespace()])
+        host_agents(node, [agent], config, stop, space, [node.get_namespace()])
         return None
 
 

@@ -60,12 +60,13 @@ class Membership:
         self._unseen = Patience()  # with a channel that is not on the graph
         self._counts: dict[str, int] = {}  # as published last
         self._following = 0  # another run that calls while this one lasts
+        self._process, self._ids = int.from_bytes(os.urandom(8), "little"), list(ids)
+        self._about = {
+            "header": Header(frame_id=names.FRAME), "process": self._process, "node": node.get_fully_qualified_name(),
+            "agent": self._ids, "settings_hash": settings_hash(settings),
+        }  # fmt: skip
         self._settings = json.dumps(settings, sort_keys=True, separators=(",", ":"))
-        self._hash = settings_hash(settings)
         self._publisher = node.create_publisher(Process, f"{swarm_namespace}/{names.PROCESS}", names.lockstep_qos())
-        self._process = int.from_bytes(os.urandom(8), "little")
-        self._node = node.get_fully_qualified_name()
-        self._ids = list(ids)
 
     def admits(self, message: Fields, sender: bytes | None) -> bool:
         """Whether a slot message is one of this run; others are counted. A channel that calls is answered.
@@ -83,14 +84,12 @@ class Membership:
         checks.check_slot(message, self._agents)
         run, phase = message.run, message.phase
         calls = phase in (Slot.PREPARE, Slot.START)
-        if self.run and run != self.run:
-            if phase == Slot.PREPARE:
+        if (self.run and run != self.run) or not (run in self._callers or (run and calls)):
+            if self.run and phase == Slot.PREPARE:
                 self._following = run
                 self._publish_counts(left_over=True)
-            detail = f"slot message of run {run_text(run)}; this one is {run_text(self.run)}"
-            raise BadMessage(checks.OTHER_RUN, detail)
-        if run not in self._callers and not calls:
-            raise BadMessage(checks.OTHER_RUN, f"slot message of run {run_text(run)}, which has not called here")
+            detail = f"slot message of run {run_text(run)}"
+            raise BadMessage(checks.OTHER_RUN, f"{detail}; this one is {run_text(self.run)}" if self.run else detail)
         caller = self._callers.get(run) or self._add_caller(run, message.data, sender)
         if phase == Slot.END:
             if not caller.call.ended_by(message.data):
@@ -109,8 +108,6 @@ class Membership:
 
     def _add_caller(self, run: int, data: bytes, sender: bytes | None) -> _Caller:
         """A channel calls for the first time."""
-        if not run:
-            raise BadMessage(checks.OTHER_RUN, "a call without a run")
         try:
             call = Call.from_bytes(data)
         except ValueError as error:
@@ -135,21 +132,16 @@ class Membership:
         return self._callers[self.run].call.session
 
     def _read_refusal(self, data: bytes) -> None:
-        """The channel sends a process away.
-
-        :raises ConfigError: if it is this one.
-        """
+        """The channel sends a process away; ConfigError: it is this one."""
         if int.from_bytes(data[:8], "little") != self._process:
             return
         if self.run and time.monotonic() - self._began_s > _REFUSABLE_S:
             raise BadMessage(checks.OTHER_SENDER, "this process takes part, and is told to go")
         try:
-            reason = checks.parse_json(data[8:])
-        except ValueError:
-            reason = None
-        if not isinstance(reason, list) or len(reason) != 3:
-            raise BadMessage(checks.RANGE, "a refusal without a reason")
-        raise ConfigError(checks.plain(str(reason[0])), reason[1], checks.plain(str(reason[2])))
+            name, value, allowed = checks.parse_json(data[8:])
+        except (ValueError, TypeError):
+            raise BadMessage(checks.RANGE, "a refusal without a reason") from None
+        raise ConfigError(checks.plain(str(name)), value, checks.plain(str(allowed)))
 
     def _publish_counts(self, left_over: bool = False) -> None:
         """Publish the counts of this run's messages, not too often."""
@@ -160,18 +152,12 @@ class Membership:
 
     def _publish(self, run: int, settings: str = "") -> None:
         counts = self.counts()
-        self._publisher.publish(
-            Process(
-                header=Header(frame_id=names.FRAME), run=run, process=self._process, node=self._node, agent=self._ids,
-                settings_hash=self._hash, settings=settings, dropped_reason=list(counts), dropped=list(counts.values()),
-            )
-        )  # fmt: skip
+        dropped = {"dropped_reason": list(counts), "dropped": list(counts.values())}
+        self._publisher.publish(Process(run=run, settings=settings, **self._about, **dropped))
 
     def counts(self) -> dict[str, int]:
         """Return the number of messages and frames not received so far, by reason."""
-        counts = dict(self.intake.counts)
-        checks.add_counts(counts, {name: count for name, count in self._dropped_frames().items() if count})
-        return counts
+        return dict(self.intake.counts) | {name: count for name, count in self._dropped_frames().items() if count}
 
     def idle(self, publishers: int, slot: int) -> None:
         """Look around, about ten times a second: number of publishers of slot messages, last slot answered.
@@ -181,7 +167,7 @@ class Membership:
         if not self.run:
             return
         self._publish_counts()
-        channel = self._callers[self.run].call.channel
+        channel = self._callers[self.run].call
         if publishers or channel.is_paused:  # one that is stopped for long leaves the graph, too, and comes back
             self._unseen = Patience()
         if self._unseen.spent_s() > _LOST_S or channel.has_ended:

@@ -83,13 +83,13 @@ class OdometryVehicle(AgentVehicle):
     def __init__(self, node: Node, settings: VehicleSettings, slot_s: float) -> None:
         self._settings, self._node = settings, node
         self._every = max(1, round(1.0 / settings.command_hz / slot_s))
+        self._frame = names.FRAME if settings.command_frame == MAP else names.body_frame(node.get_namespace())
         self.intake = Intake(node.get_logger())
-        self._origin = np.array(settings.odometry_origin)
         self._last: tuple[float, Any, Any] | None = None  # s, monotonic; m, m/s, map: last accepted
         self._attitude = (0.0, 0.0, 0.0, 1.0)  # of the same, x, y, z, w
         self._hold: Any = None  # m, map: where it was when it began to hover
-        kind = TwistStamped if settings.command_type == TWIST else VelocityWorld
-        self._publisher = node.create_publisher(kind, settings.command_topic, 1)
+        self._kind = TwistStamped if settings.command_type == TWIST else VelocityWorld
+        self._publisher = node.create_publisher(self._kind, settings.command_topic, 1)
         self._feed = Feed(node, Odometry, settings.odometry_topic, _LATEST, intake=self.intake)
         self._guard = PublisherGuard()  # of the odometry
         self._executor = SingleThreadedExecutor()
@@ -140,21 +140,18 @@ class OdometryVehicle(AgentVehicle):
 
     def _accept(self, message: Odometry) -> None:
         check_odometry(message)
-        now, last = time.monotonic(), self._last
+        now, fastest = time.monotonic(), self._settings.fastest_mps
         if not self._guard.admits(now, self._feed.sender):
             raise BadMessage(OTHER_SENDER, "odometry from two publishers")
         place, speed, q = message.pose.pose.position, message.twist.twist.linear, message.pose.pose.orientation
-        position = np.array((place.x, place.y, place.z)) + self._origin
+        position = np.array((place.x, place.y, place.z)) + self._settings.odometry_origin
         velocity, attitude = np.array((speed.x, speed.y, speed.z)), (q.x, q.y, q.z, q.w)
         if self._settings.twist_frame == BODY:
             velocity = rotate(attitude, velocity)
-        fastest = self._settings.fastest_mps
-        if math.sqrt(float(velocity @ velocity)) > fastest:
+        if math.hypot(*velocity) > fastest:
             raise BadMessage(RANGE, f"odometry of more than {fastest:g} m/s")
-        if last is not None:
-            away = position - last[1]
-            if math.sqrt(float(away @ away)) > _SLACK_M + fastest * (now - last[0]):
-                raise BadMessage(RANGE, "odometry that has jumped")
+        if self._last is not None and math.dist(position, self._last[1]) > _SLACK_M + fastest * (now - self._last[0]):
+            raise BadMessage(RANGE, "odometry that has jumped")
         self._last, self._attitude = (now, position, velocity), attitude
 
     def sense(self, swarm: Swarm) -> None:
@@ -190,14 +187,10 @@ class OdometryVehicle(AgentVehicle):
         if self._settings.command_frame == BODY:
             x, y, z, w = self._attitude
             velocity = rotate((-x, -y, -z, w), velocity)
-        if self._settings.command_type == TWIST:
-            message = TwistStamped()
-            message.header.frame_id = (
-                names.FRAME if self._settings.command_frame == MAP else names.body_frame(self._node.get_namespace())
-            )
-            speed = message.twist.linear
+        message = self._kind()
+        if self._kind is TwistStamped:
+            message.header.frame_id, speed = self._frame, message.twist.linear
         else:
-            message = VelocityWorld()
             speed = message.vel
         message.header.stamp = self._node.get_clock().now().to_msg()
         speed.x, speed.y, speed.z = map(float, velocity)
@@ -245,10 +238,7 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
 
 
 def _recorder(out: str) -> Any:
-    """Return what records an agent, as ``recorder(out, agent, port_settings)``: a context in which it flies.
-
-    :raises ConfigError: if there is none here.
-    """
+    """Return what records an agent, as ``recorder(out, agent, port_settings)``: a context in which it flies."""
     recorders = [*entry_points(group=_RECORDERS, name="agent")]
     if not recorders:
         raise ConfigError("out", out, "no directory, for the package dtsa_bench, which records, is not here")

@@ -1,26 +1,15 @@
 """Agents on their own clocks: no agent waits for another, and a frame that is late is late.
 
-How a flight in real time works, and where each part stands ("channel": `dtsa_channel_sim/ros`):
-
-1. **The time line.** The channel calls all processes (`roster`), then sends START with the time of slot 0 on
-   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own (`air/port.ClockMap`),
-   off by an offset and a drift.
-2. **A slot here.** Each agent is a station (`core/station`) that says when it is due: :meth:`RealtimeNode._serve`. It
-   ends the slot before, decides, and gives the frame to send. That is published with the time at which its transmission
-   starts, mostly some time ahead; then the vehicles move. A frame that would leave half a slot late is not sent.
-3. **On the air.** The channel (`realtime_channel`) puts each frame on the time line (`model/air`). Once no frame that
-   overlaps it can come any more, its receivers are known, by reach, overlap and losses. A RUN message delivers it to
-   all processes with the receivers' bits.
-4. **Received.** :meth:`~RealtimeNode._receive` hands it to the stations of those agents whose bit is set. The time of
-   its arrival shows which slot it is of, and moves their own slots.
-5. **Reported.** Some ten times a second a process reports what its agents decided, received and flew (`reporter`). The
-   channel fills an account for each slot (`answers`); it closes when all have reported or have been given up. The
-   recorder, the metrics and the live view get closed accounts only: what agents had, not what they should have had.
-6. **Late.** No agent is waited for. One that is behind by too much restarts with the present slot, in probation. The
-   channel itself (`realtime_channel.Pace`) ends a flight that cannot keep up, with the reason.
-7. **Coming and going.** A late agent listens, takes the time from the first frame that it hears, and hovers until the
-   others know it: all rules of the station. One that gets a signal announces in its own turns that it leaves, and
-   ends then (:meth:`~RealtimeNode._ended`).
+1. **Time.** The channel calls all processes, then sends START with the time of slot 0 on CLOCK_MONOTONIC. Slot T lies
+   T slot lengths after it. Each agent has a clock of its own, off by an offset and a drift.
+2. **A slot.** Each agent is a station (`core/station`) that says when it is due, decides, and gives the frame to send.
+   That is published with the time at which its transmission starts, mostly some time ahead; then the vehicles move.
+   A frame that would leave half a slot late is not sent.
+3. **The air.** The channel finds a frame's receivers and delivers it to all processes. The stations whose bits are set
+   receive it; the time of its arrival moves their slots.
+4. **Reports.** Some ten times a second a process reports what its agents decided, received and flew (`reporter`).
+5. **Coming and going.** A late agent listens, takes the time from the first frame that it hears, and hovers until the
+   others know it. One that gets a signal announces in its own turns that it leaves, and ends then.
 """
 
 from __future__ import annotations
@@ -29,34 +18,21 @@ import os
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 
 import numpy as np
 from dtsa_msgs.msg import Frame, Report, Slot
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
 from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core import station as core
 from dtsa_agent.core.agent import REFUSED
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator
-from dtsa_agent.core.station import (
-    KEEPS_NOTHING,
-    KEEPS_NUMBERS,
-    KEEPS_STARTS,
-    LENGTH,
-    NO_FRAME,
-    REJECTED,
-    REPEATED,
-    Link,
-    Station,
-    StationSettings,
-    check_joinable,
-)
+from dtsa_agent.core.station import Link, Station, StationSettings
 from dtsa_agent.core.swarm import PRESENT_LEAVING
 from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
@@ -74,7 +50,6 @@ _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
 _TRUST_NS = 1_000_000  # frames that are off by more do not move slots
 _BURST = 64  # messages received at a time: whatever comes, the own slots go on
-_MALFORMED = (LENGTH, NO_FRAME)  # of the reasons for which a station refuses frames
 
 
 class RealtimeAgent:
@@ -83,14 +58,13 @@ class RealtimeAgent:
     All times but the station's own are ns on the channel's time line, from the start of slot 0; for the clock,
     CLOCK_MONOTONIC stands for it.
 
+    :param index: place among the agents here.
     :param jitter_ns: standard deviation of the time of a single transmission.
-    :param accepted: called for each frame that the agent receives: sender, its slot, the slot here.
-    :param refused: called with the reason for each that it refuses; empty: because of its content.
     """
 
     def __init__(
-        self, id: int, config: SwarmConfig, scenario: Scenario, clock: ClockMap, jitter_ns: float,
-        accepted: Callable[[int, int, int], None], refused: Callable[[str], None],
+        self, id: int, index: int, config: SwarmConfig, scenario: Scenario, clock: ClockMap, jitter_ns: float,
+        reporter: Reporter,
     ) -> None:  # fmt: skip
         self.id, self.clock = id, clock
         self.swarm = make_swarm(config, scenario, local=[id])
@@ -98,9 +72,10 @@ class RealtimeAgent:
         self.start_ns = 0  # of its slot, or of the transmission in it
         self.frame = b""  # that it sends in this slot
         self.due_ns = _NEVER
+        self.refusals: Counter[str] = Counter()  # frames, by reason; empty: because of their content
+        self._index, self._reporter = index, reporter
         self._slot_ns, self._jitter_ns = config.slot_ns, jitter_ns
         self._random = generator(config.seed, STREAM_CLOCKS, id)
-        self._accepted, self._refused = accepted, refused
         self._zero = self._start_ns = 0
         self._opened = False
 
@@ -151,30 +126,27 @@ class RealtimeAgent:
     # Events of the station.
 
     def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
-        """A slot is open."""
         self._opened = True
 
     def restarted(self, slot: int) -> None:
-        """Nothing to do."""
+        pass
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
-        """A frame was heard in its slot."""
         if accepted:
-            self._accepted(sender, slot, self.station.slot)
+            self._reporter.add_received(self._index, sender, slot, self.station.slot)
         else:
-            self._refused("")
+            self.refusals[""] += 1
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
-        """A frame was not accepted."""
-        self._refused(fault)
+        if fault != core.REPEATED:  # it has it
+            self.refusals[fault] += 1
 
 
 class RealtimeNode(AgentsNode):
     """Agents that begin their slots by themselves.
 
-    As on a vehicle, where a timer sends what is ready, decisions are made a little before a slot. A frame carries the
-    time at which its agent starts to send it: its slot's start, or later if it was not ready by then. A process that
-    comes after the channel's call is told where the time line lies, too, because the stamps of messages are on it.
+    A process that comes after the channel's call is told where the time line lies, too, because the stamps of messages
+    are on it.
 
     :param ids: of the agents that live here, ascending.
     :param clocks: one an agent, on the channel's time line; none: without offset and drift.
@@ -195,30 +167,24 @@ class RealtimeNode(AgentsNode):
     ) -> None:  # fmt: skip
         self.slot_ns, self._flight_ns = config.slot_ns, flight_time_ns
         self._authenticator, self._align = authenticator, align
+        qos = names.lockstep_qos(names.REALTIME_WAITING)
+        self._air = node.create_publisher(Frame, f"{swarm_namespace}/{names.AIR_FRAME}", qos)
+        self._telemetry = node.create_publisher(Report, f"{swarm_namespace}/{names.REPORT}", qos)
+        self._reporter = Reporter(self._telemetry, config, ids)
         scenario = make_scenario(config)
         clocks = clocks or [ClockMap(began_ns=0)] * len(ids)
         self.agents = [
-            RealtimeAgent(agent, config, scenario, clock, jitter_ns, partial(self._accepted, index), self._refuse)
+            RealtimeAgent(agent, index, config, scenario, clock, jitter_ns, self._reporter)
             for index, (agent, clock) in enumerate(zip(ids, clocks, strict=True))
         ]
         self._columns = np.array(ids) - 1
-        self._refused = 0  # frames that reached an agent and were refused, over all agents
-        self._faults: set[str] = set()  # why agents have refused the present frame
-        self._dropped: Counter[str] = Counter()  # frames that any agent has refused, by reason
         self._priority = priority  # still to be taken
         self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3)
         self._called = False  # the channel called before it started
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
-        self._heard_ns = 0  # ns on the time line, when frames are handed to the agents
         self._leaves_by: int | None = None  # slot: all have left then at the latest; None: no agent leaves
         self._signals = 0  # when that began
         super().__init__(node, config, ids, swarm_namespace, names.REALTIME_WAITING)
-
-    def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
-        create = self.node.create_publisher
-        self._air = create(Frame, f"{swarm_namespace}/{names.AIR_FRAME}", qos)
-        self._telemetry = create(Report, f"{swarm_namespace}/{names.REPORT}", qos)
-        self._reporter = Reporter(self._telemetry, self.config, self.ids)
 
     def _check_next(self, message: Fields) -> None:
         now = time.monotonic_ns()
@@ -233,15 +199,17 @@ class RealtimeNode(AgentsNode):
             check_start(message.time_ns - names.TIME_ZERO_NS - self._flight_ns, now - self._zero)
 
     def _dropped_frames(self) -> dict[str, int]:
-        malformed = sum(self._dropped[fault] for fault in _MALFORMED)
-        rejected = self._dropped[REJECTED]
-        foreign = self._dropped.total() - malformed - rejected
+        most: Counter[str] = Counter()  # a frame that several agents have refused counts once
+        for agent in self.agents:
+            most |= agent.refusals
+        malformed, rejected = most[core.LENGTH] + most[core.NO_FRAME], most[core.REJECTED]
         return {
             "frame malformed": malformed + max(agent.swarm.malformed for agent in self.agents),
-            "frame foreign": foreign + max(agent.swarm.foreign for agent in self.agents),
+            "frame foreign": most.total() - most[""] - malformed - rejected
+            + max(agent.swarm.foreign for agent in self.agents),
             "frame rejected": rejected,
-            REFUSED: self._refused,
-        }
+            REFUSED: sum(agent.refusals.total() for agent in self.agents),
+        }  # fmt: skip
 
     # From the call to the end.
 
@@ -250,7 +218,7 @@ class RealtimeNode(AgentsNode):
 
         :raises ConfigError: in a flight under way that agents of this policy cannot come into.
         """
-        while not self._ended(stop):
+        while not self._has_ended(stop):
             if not self._zero:
                 message = self.loop.wait()
                 if message is not None and not self._prepare(message):
@@ -260,7 +228,7 @@ class RealtimeNode(AgentsNode):
             if self.loop.housekeeping():
                 self.idle()
 
-    def _ended(self, stop: Stop) -> bool:
+    def _has_ended(self, stop: Stop) -> bool:
         """Whether to end now because of a signal: the second one, or when all agents here have left after the first."""
         if not stop:
             return False
@@ -304,14 +272,9 @@ class RealtimeNode(AgentsNode):
             self._priority = 0
 
     def _may_join(self) -> bool:
-        """Whether the channel has found all that this process publishes: what is published before is lost.
-
-        :raises ConfigError: with a policy whose tables all have to be equal.
-        """
-        check_joinable(self.config.policy)
-        return self.membership.is_connected() and bool(
-            self._air.get_subscription_count() and self._telemetry.get_subscription_count()
-        )
+        """Whether the channel has found all that this process publishes: what is published before is lost."""
+        core.check_joinable(self.config.policy)
+        return self.membership.is_connected() and all(p.get_subscription_count() for p in (self._air, self._telemetry))
 
     def _begin(self, run: int, zero: int) -> None:
         """The run begins for these agents, with slot 0 at a time of CLOCK_MONOTONIC, ns."""
@@ -319,12 +282,14 @@ class RealtimeNode(AgentsNode):
         self._zero = zero
         if self._authenticator is not None and not self.config.auth_session:
             self._authenticator.begin(self.membership.session)
-        keeps = KEEPS_NUMBERS if self._called else KEEPS_NOTHING  # the channel has said what time it is, or not
+        keeps = (
+            core.KEEPS_NUMBERS if self._called else core.KEEPS_NOTHING
+        )  # the channel has said what time it is, or not
         link = Link(b"", says_late=False, names=0, flight_ns=self._flight_ns, trust_ns=_TRUST_NS)
         for agent in self.agents:
             settings = StationSettings(
                 self.config, link, self._authenticator, agent.id, origin_ns=0, listens=not self._called,
-                keeps_time=keeps if self._align else KEEPS_STARTS,
+                keeps_time=keeps if self._align else core.KEEPS_STARTS,
             )  # fmt: skip
             agent.begin(settings, zero)
         for agent, place in zip(self.agents, self._resume_at if not self._called else (), strict=False):
@@ -348,10 +313,10 @@ class RealtimeNode(AgentsNode):
             if not self._receive(message):
                 return False
         self._sense()
+        now = self._reporter.now_ns = time.monotonic_ns() - self._zero
         opened = []
-        self._heard_ns = time.monotonic_ns() - self._zero
         for index, agent in enumerate(self.agents):
-            while agent.due_ns <= self._heard_ns:
+            while agent.due_ns <= now:
                 if agent.step():
                     opened.append(index)
                     self._send(agent)
@@ -364,32 +329,18 @@ class RealtimeNode(AgentsNode):
         """Hand frames to the agents that receive them; return False when the run is over."""
         if message.phase != Slot.RUN:
             return bool(message.phase != Slot.END)
-        self._heard_ns = time.monotonic_ns() - self._zero
-        arrival = message.time_ns - names.TIME_ZERO_NS
+        self._reporter.now_ns = time.monotonic_ns() - self._zero
         received = unpack_received(message.received, len(message.sender), self.config.agents)
         for frame, mask in zip(split_frames(message.data, message.length), received, strict=True):
-            self._faults.clear()
             for index in np.flatnonzero(mask[self._columns]).tolist():
-                self.agents[index].receive(frame, arrival)
-            self._dropped.update(self._faults)
+                self.agents[index].receive(frame, message.time_ns - names.TIME_ZERO_NS)
         return True
-
-    def _accepted(self, index: int, sender: int, slot: int, here: int) -> None:
-        self._reporter.add_received(index, sender, slot, here, self._heard_ns)
-
-    def _refuse(self, fault: str) -> None:
-        if fault == REPEATED:  # it has it
-            return
-        self._refused += 1
-        if fault:
-            self._faults.add(fault)
 
     def _send(self, agent: RealtimeAgent) -> None:
         """Hand the frame of an agent over to the channel, before anything else is done."""
-        if not agent.frame:
-            return
-        header, data = header_of(names.TIME_ZERO_NS + agent.start_ns), array("B", agent.frame)
-        self._air.publish(Frame(header=header, run=self.membership.run, slot=agent.slot, agent=agent.id, data=data))
+        if agent.frame:
+            header, data = header_of(names.TIME_ZERO_NS + agent.start_ns), array("B", agent.frame)
+            self._air.publish(Frame(header=header, run=self.membership.run, slot=agent.slot, agent=agent.id, data=data))
 
     def _fly_on(self, opened: Sequence[int]) -> None:
         """Report the slots that agents, by their places here, have opened, and fly their vehicles through them."""

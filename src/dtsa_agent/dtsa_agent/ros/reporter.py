@@ -15,11 +15,10 @@ from dtsa_agent.ros.common.messages import REPORT
 
 _PERIOD_NS = 100_000_000
 _MOST_RECEIVED = 1000  # frames that wait to be reported: far more than a swarm sends in one period
-
-# Fields of a swarm, as they are, and before them the start of a slot or transmission and the length of the frame.
-_FIELDS = {"chosen": "<u2", "reason": "u1", "digest": "<u4", "score": "<f8", "track": "<f8", "velocity": "<f8",
-           "command": "<f8", "goal": "<f8"}  # fmt: skip
-_KINDS = {"offset_ns": "<i8", "length": "u1", **_FIELDS}
+# Fields of an agent's slot: start of the slot or transmission, length of the frame, and arrays of its swarm.
+_KINDS = {"offset_ns": "<i8", "length": "u1", "chosen": "<u2", "reason": "u1", "digest": "<u4", "score": "<f8",
+          "track": "<f8", "velocity": "<f8", "command": "<f8", "goal": "<f8"}  # fmt: skip
+_OF_SWARM = tuple(_KINDS)[2:]
 _RECEIVED_KINDS = {"heard_sender": "H", "heard_slot": "I", "heard_in": "I", "heard_ns": "q"}
 
 
@@ -38,6 +37,7 @@ class Reporter:
         self._last = -1  # slot reported last
         self._rows: dict[int, dict[int, tuple[bytes, ...]]] = {}  # by slot and agent
         self._received: dict[tuple[int, int, int, int], int] = {}  # by sender, slot, slot here, ns: bits of the agents
+        self.now_ns = 0  # on the channel's time line
 
     def add_slot(self, index: int, slot: int, offset_ns: int, length: int, swarm: Swarm) -> None:
         """Note what an agent, alone in its swarm, has decided for a slot, and where it is; before it flies on.
@@ -47,12 +47,12 @@ class Reporter:
         :param length: bytes of the frame that was sent, as the air carries it; 0: none.
         """
         own = offset_ns.to_bytes(8, "little", signed=True), bytes((length,))
-        self._rows.setdefault(slot, {})[index] = own + tuple(getattr(swarm, name).tobytes() for name in _FIELDS)
+        self._rows.setdefault(slot, {})[index] = own + tuple(getattr(swarm, name).tobytes() for name in _OF_SWARM)
 
-    def add_received(self, index: int, sender: int, slot: int, here: int, at_ns: int) -> None:
-        """Note a frame that an agent has received: the slot that its sender counted, the slot here, channel time."""
+    def add_received(self, index: int, sender: int, slot: int, here: int) -> None:
+        """Note a frame that an agent receives now: the slot that its sender counted, and the slot here."""
         if len(self._received) < _MOST_RECEIVED:
-            key = sender, slot, max(0, here), at_ns
+            key = sender, slot, max(0, here), self.now_ns
             self._received[key] = self._received.get(key, 0) | 1 << index
 
     def is_due(self, slot: int) -> bool:
@@ -60,41 +60,33 @@ class Reporter:
         return slot > self._last and (slot - self._last >= self._every or slot % self._every == self._phase)
 
     def publish(self, run_id: int, slot: int) -> None:
-        """Publish all that has been collected up to a slot."""
+        """Publish all that has been collected up to a slot: one message for slots that the same agents have begun.
+
+        Frames that were received are in one of all agents.
+        """
         self._last = slot if slot < names.FIRST_CALL else -1
+        ready = {row: self._rows.pop(row) for row in sorted(self._rows) if row <= slot}
+        groups = [(agents, list(slots)) for agents, slots in groupby(ready, lambda row: tuple(sorted(ready[row])))]
         all_agents = tuple(range(len(self._ids)))
-        ready = sorted(row for row in self._rows if row <= slot)
-        groups = [(agents, list(slots)) for agents, slots in groupby(ready, key=lambda s: tuple(sorted(self._rows[s])))]
         if self._received and all_agents not in [agents for agents, _ in groups]:
             groups.append((all_agents, []))
         for agents, slots in groups:
-            rows = [self._rows[row][index] for row in slots for index in agents]
-            columns = zip(*rows, strict=True) if rows else ((),) * len(_KINDS)
-            shape = len(slots), len(agents), -1
-            fields = {
-                name: np.frombuffer(b"".join(column), kind).reshape(shape).transpose(0, 2, 1).tobytes() if rows else b""
-                for (name, kind), column in zip(_KINDS.items(), columns, strict=True)
-            } | self._pack_received(agents == all_agents)
+            fields = dict.fromkeys((*_KINDS, *_RECEIVED_KINDS, "heard_by"), b"")
+            columns = zip(*[ready[row][index] for row in slots for index in agents], strict=True)
+            for (name, kind), column in zip(_KINDS.items(), columns, strict=False):
+                values = np.frombuffer(b"".join(column), kind).reshape(len(slots), len(agents), -1)
+                fields[name] = values.transpose(0, 2, 1).tobytes()
+            if agents == all_agents:
+                received, self._received = self._received, {}
+                for (name, kind), column in zip(_RECEIVED_KINDS.items(), zip(*received, strict=True), strict=False):
+                    fields[name] = array(kind, column).tobytes()
+                width = -(-len(agents) // 8)
+                fields["heard_by"] = b"".join(bits.to_bytes(width, "little") for bits in received.values())
             last = slots[-1] if slots and slots[-1] < names.FIRST_CALL else 0
+            agent = array("H", [self._ids[index] for index in agents]).tobytes()
             self._publisher.publish(
                 REPORT.pack_fields(
-                    names.slot_time_ns(last, self._config.slot_ns),
-                    run=run_id,
-                    steps=self._config.steps,
-                    agent=array("H", [self._ids[index] for index in agents]).tobytes(),
-                    slot=array("I", slots).tobytes(),
-                    **fields,
+                    names.slot_time_ns(last, self._config.slot_ns), run=run_id, steps=self._config.steps, agent=agent,
+                    slot=array("I", slots).tobytes(), **fields,
                 )
-            )
-        for row in ready:
-            del self._rows[row]
-
-    def _pack_received(self, of_all: bool) -> dict[str, bytes]:
-        """Return the frames received since the last report; none in a report of some agents alone."""
-        received, width = self._received if of_all else {}, -(-len(self._ids) // 8)
-        if of_all:
-            self._received = {}
-        columns = list(zip(*received, strict=True)) or [()] * 4
-        kinds = zip(_RECEIVED_KINDS.items(), columns, strict=True)
-        fields = {name: array(kind, column).tobytes() for (name, kind), column in kinds}
-        return {**fields, "heard_by": b"".join(bits.to_bytes(width, "little") for bits in received.values())}
+            )  # fmt: skip

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
-from dtsa_agent.core.settings.declaration import Setting, Settings, setting
+from dtsa_agent.core.settings.declaration import Setting, setting
 from dtsa_agent.keys import authenticator, with_key
 from dtsa_agent.priority import PrioritySettings, set_nice
 from dtsa_agent.ros.common import names
@@ -39,7 +39,7 @@ _SHARED = Setting(
 
 
 @dataclass(frozen=True, slots=True)
-class HostSettings(Settings):
+class HostSettings(PrioritySettings):
     """How agents live in a process, beside what the whole swarm agrees on."""
 
     odometry: bool = setting(True, "offer each agent's true motion as <agent>/odom")
@@ -47,35 +47,23 @@ class HostSettings(Settings):
         names.MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own",
         choices=names.MODES,
     )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class RealtimeSettings(Settings):
-    """What the agents of a process have in common in real time."""
-
     clock_jitter_ns: float = setting(
-        0.0, "standard deviation of the time of one transmission", unit="ns", minimum=0, maximum=1e9
+        0.0, "in real time: standard deviation of the time of one transmission", unit="ns", minimum=0, maximum=1e9
     )
-    align: bool = setting(True, "agents move their slots towards what they hear")
+    align: bool = setting(True, "in real time: agents move their slots towards what they hear")
     nice: int = setting(
-        0, "without real-time priority: by how much this process gives way to others, the channel above all: nice",
-        minimum=0, maximum=19,
+        0, "in real time, without real-time priority: by how much this process gives way to others, the channel above "
+        "all: nice", minimum=0, maximum=19,
     )  # fmt: skip
 
 
 def declare_swarm(node: Node) -> SwarmConfig:
-    """Declare the swarm's settings and return their values.
-
-    :raises ConfigError: for settings that are not usable.
-    """
+    """Declare the swarm's settings and return their values; ConfigError: they are not usable."""
     return SwarmConfig.from_dict(declare_settings(node, SwarmConfig))
 
 
 def declare_ids(node: Node, agents: int) -> list[int]:
-    """Declare which of N agents live in a process; return their ids, ascending.
-
-    :raises ConfigError: if there are others.
-    """
+    """Declare which of N agents live in a process; return their ids, ascending. ConfigError: there are others."""
     listed = declare_list(node, "ids", [0], "ids of the agents in this process; [0]: all")
     ids = sorted(agent for agent in listed if agent) or list(range(1, agents + 1))
     if len(set(ids)) != len(ids) or ids[0] < 1 or ids[-1] > agents:
@@ -84,25 +72,24 @@ def declare_ids(node: Node, agents: int) -> list[int]:
 
 
 def host_agents(
-    node: Node, ids: Sequence[int], config: SwarmConfig, stop: Stop, space: str = names.SWARM, shared: bool = False,
-    spaces: Sequence[str] | None = None,
+    node: Node, ids: Sequence[int], config: SwarmConfig, stop: Stop, space: str, spaces: Sequence[str],
+    shared: bool = False,
 ) -> None:  # fmt: skip
     """Declare the rest of the parameters and run agents until the end.
 
     :param ids: of the agents that live here, ascending.
     :param space: namespace of what the whole swarm shares.
+    :param spaces: namespace of each agent.
     :param shared: whether one table serves all.
-    :param spaces: namespace of each agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
     :raises ConfigError: for settings that are not usable.
     """
     if shared and not can_share_table(config):
         raise ConfigError("shared_table", True, f"false with policy {config.policy}")
     host = HostSettings(**declare_settings(node, HostSettings))
-    priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
     if host.mode == names.MODES[0]:
         agents: AgentsNode = SwarmNode(node, with_key(make_swarm(config, local=ids, shared_table=shared)), space)
     else:
-        agents = _realtime_node(node, config, ids, space, priority)
+        agents = _realtime_node(node, config, ids, space, host)
     if host.odometry:
         agents.offer_odometry(spaces)
     logger = node.get_logger()
@@ -118,7 +105,7 @@ def host_agents(
         agents.loop.close()
 
 
-def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, priority: int) -> AgentsNode:
+def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, host: HostSettings) -> AgentsNode:
     from .realtime import ClockMap, RealtimeNode
 
     def declare_numbers(name: str, count: int, text: str) -> list[int]:
@@ -131,18 +118,17 @@ def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: s
     text = "offset of each agent's clock at the start, one for all or one an agent; positive: early (ns)"
     offset = declare_numbers("clock_offset_ns", count, text)
     drift = declare_numbers("clock_drift_ppb", count, "by how much each agent's clock runs fast (parts per billion)")
-    own = RealtimeSettings(**declare_settings(node, RealtimeSettings))
     text = "from the order to send until a receiver has the frame: for any frame, and more for each of its bytes (ns)"
     fixed, per_byte = declare_numbers("flight_time_ns", 2, text)
     text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
     places = declare_list(node, "resume_at", [0.0], text)
     if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):
         raise ConfigError("resume_at", places, f"{3 * count} numbers with a decimal point: x, y, z of each agent")
-    if own.nice:
-        set_nice(own.nice)
+    if host.nice:
+        set_nice(host.nice)
     return RealtimeNode(
-        node, config, ids, space, authenticator=authenticator(config), jitter_ns=own.clock_jitter_ns, align=own.align,
-        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)], priority=priority,
+        node, config, ids, space, authenticator=authenticator(config), jitter_ns=host.clock_jitter_ns, align=host.align,
+        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)], priority=host.priority,
         flight_time_ns=fixed + per_byte * config.frame_length, resume_at=places if len(places) > 1 else (),
     )  # fmt: skip
 
@@ -152,7 +138,8 @@ def _body(stop: Stop, supervised: bool) -> None:
     with ending(node):
         config = declare_swarm(node)
         ids = declare_ids(node, config.agents)
-        host_agents(node, ids, config, stop, space, declare_setting(node, _SHARED))
+        spaces = [names.agent_namespace(agent, space) for agent in ids]
+        host_agents(node, ids, config, stop, space, spaces, declare_setting(node, _SHARED))
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -2,41 +2,37 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Sequence
 
-import numpy as np
 from dtsa_msgs.msg import Slot, Transmission
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
-from rclpy.task import Future
 
 from dtsa_agent.core import AgentGroup, Swarm
 from dtsa_agent.core.agent import REFUSED
-from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import POSE_COVARIANCE, TWIST_COVARIANCE, split_frames, unpack_received
 from dtsa_agent.ros.common.checks import SLOT as SLOT_REASON
 from dtsa_agent.ros.common.checks import BadMessage
-from dtsa_agent.ros.common.loop import HOUSEKEEPING_S, Loop
-from dtsa_agent.ros.common.messages import SLOT, TRANSMISSION, Fields, time_of
+from dtsa_agent.ros.common.loop import Loop
+from dtsa_agent.ros.common.messages import SLOT, TRANSMISSION, Fields, header_of
 from dtsa_agent.ros.common.runs import WaitingLog
 from dtsa_agent.stop import Stop
 
 from .membership import Membership
 
-_SERVE_S = 0.001  # an executor reads messages so often
 _OTHER_MESSAGES = 32  # that may wait beside the channel's: they must not push those out before they are read
 _ODOMETRY_DEPTH = 10  # messages for a slow reader; reliable, because RViz asks for that
 
 
 class AgentsNode(ABC):
     """What nodes of agents have in common: membership of a run, its loop, odometry.
+
+    Subclasses make their publishers first: a channel that knows this process has then found them, too.
 
     :param ids: of the agents that live here, ascending.
     :param waiting: a quarter of the messages that may wait to be read.
@@ -49,10 +45,8 @@ class AgentsNode(ABC):
         self.slot = -1  # the last slot that has begun here
         self._odometry: list[tuple[int, Publisher, str]] = []  # place among those here, frame of the body
         self._watched: list[tuple[int, Publisher, str]] = []  # those of them with subscribers
-        self._namespace = swarm_namespace
         self._waiting = WaitingLog(node.get_logger())
         self._has_begun = False
-        self._make_publishers(swarm_namespace, names.lockstep_qos(waiting))
         settings = agreed_settings(config, self.mode)
         self.membership = Membership(node, ids, settings, swarm_namespace, self._dropped_frames, self._check_next)
         qos, topic = names.lockstep_qos(max(waiting, _OTHER_MESSAGES // 4)), f"{swarm_namespace}/{names.SLOT}"
@@ -64,9 +58,6 @@ class AgentsNode(ABC):
         """Fly until the run is over or a signal comes."""
 
     @abstractmethod
-    def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None: ...
-
-    @abstractmethod
     def _dropped_frames(self) -> dict[str, int]:
         """Return the number of frames that this process has kept out so far, by reason and over all agents."""
 
@@ -74,13 +65,9 @@ class AgentsNode(ABC):
     def _check_next(self, message: Fields) -> None:
         """Raise BadMessage for a slot message that cannot be the next one."""
 
-    def offer_odometry(self, namespaces: Sequence[str] | None = None) -> None:
-        """Offer each agent's true motion as ``odom``; published only while a node subscribes.
-
-        :param namespaces: one an agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
-        """
-        default = [names.agent_namespace(agent, self._namespace) for agent in self.ids]
-        for index, space in enumerate(namespaces or default):
+    def offer_odometry(self, namespaces: Sequence[str]) -> None:
+        """Offer each agent's true motion as ``odom`` in its namespace; published only while a node subscribes."""
+        for index, space in enumerate(namespaces):
             topic = f"{space.rstrip('/')}/{names.ODOMETRY}"
             publisher = self.node.create_publisher(Odometry, topic, _ODOMETRY_DEPTH)
             self._odometry.append((index, publisher, names.body_frame(space)))
@@ -94,8 +81,8 @@ class AgentsNode(ABC):
         publishers = subscription.get_publisher_count()
         self.membership.idle(publishers, self.slot)
         if self.slot < 0:
-            channel = "the channel is there" if publishers else f"a channel on {subscription.topic_name}"
-            self._waiting.log(f"waiting for {'slot 0: ' if publishers else ''}{channel}")
+            channel = "slot 0: the channel is there" if publishers else f"a channel on {subscription.topic_name}"
+            self._waiting.log(f"waiting for {channel}")
         elif not self._has_begun:
             self._has_begun = True
             self.node.get_logger().info(f"slot 0 has begun: run {self.membership.run:08x}")
@@ -103,12 +90,10 @@ class AgentsNode(ABC):
 
     def _publish_odometry(self, entry: tuple[int, Publisher, str], swarm: Swarm, column: int, slot: int) -> None:
         """Publish the position of an agent, in a column of a swarm, at the start of a slot."""
-        message = Odometry()
-        message.pose.covariance, message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
-        message.header.frame_id = names.FRAME
-        message.header.stamp = time_of(names.slot_time_ns(slot, self.config.slot_ns))
         # The attitude is not modelled, it is the identity: the body's axes are those of the map.
-        message.child_frame_id = entry[2]
+        header = header_of(names.slot_time_ns(slot, self.config.slot_ns))
+        message = Odometry(header=header, child_frame_id=entry[2])
+        message.pose.covariance, message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
         place, speed = message.pose.pose.position, message.twist.twist.linear
         place.x, place.y, place.z = swarm.position[:, column].tolist()
         speed.x, speed.y, speed.z = swarm.velocity[:, column].tolist()
@@ -127,13 +112,11 @@ class SwarmNode(AgentsNode):
     def __init__(self, node: Node, swarm: Swarm, swarm_namespace: str = names.SWARM) -> None:
         self.agents = AgentGroup(swarm)
         self._goal = b""  # as last sent
-        self._no_frames = np.zeros((0, swarm.config.agents), dtype=np.uint8)
-        super().__init__(node, swarm.config, swarm.ids, swarm_namespace, 1)
-
-    def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
-        self._agent_ids = array("H", self.ids).tobytes()
+        self._agent_ids = array("H", swarm.ids).tobytes()
         self._bytes = b""  # the last answer
-        self._publisher = self.node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
+        topic = f"{swarm_namespace}/{names.TRANSMISSION}"
+        self._publisher = node.create_publisher(Transmission, topic, names.lockstep_qos())
+        super().__init__(node, swarm.config, swarm.ids, swarm_namespace, 1)
 
     @property
     def swarm(self) -> Swarm:
@@ -150,34 +133,7 @@ class SwarmNode(AgentsNode):
             raise BadMessage(SLOT_REASON, f"slot {message.slot} after slot {self.slot}")
 
     def run(self, stop: Stop) -> None:
-        """Answer slot messages until the run is over or a signal comes."""
         self.loop.run(self.on_slot, self.idle, stop)
-
-    def attach(self) -> Future:
-        """Let an ordinary executor serve these agents, instead of :meth:`run`: slower, with the same results.
-
-        Add :attr:`node` to the executor.
-
-        :returns: done when the run is over; holds the error if one ended it.
-        """
-        over = Future()
-        next_idle_s = 0.0
-
-        def serve() -> None:
-            nonlocal next_idle_s
-            try:
-                # The loop pops messages itself: one that cannot be read would end an executor that pops it.
-                message = None if over.done() else self.loop.take()
-                if message is not None and not self.on_slot(message):
-                    over.set_result(None)
-                if not over.done() and time.monotonic() >= next_idle_s:
-                    next_idle_s = time.monotonic() + HOUSEKEEPING_S
-                    self.idle()
-            except DtsaError as error:
-                over.set_exception(error)
-
-        self.node.create_timer(_SERVE_S, serve)
-        return over
 
     def on_slot(self, message: Fields) -> bool:
         """Answer a slot message; return False when the run is over."""
@@ -192,7 +148,9 @@ class SwarmNode(AgentsNode):
             if self.config.auth and not self.config.auth_session:
                 self.swarm.begin_session(self.membership.session)
         else:
-            self._receive_frames(message, slot - 1)
+            received = unpack_received(message.received, len(message.sender), self.config.agents)
+            frames = split_frames(message.data, message.length)
+            self.agents.on_frames(slot - 1, message.sender, frames, received)
             self.agents.on_slot_end()
         self._answer(slot, self.agents.on_slot(slot))
         self.slot = slot
@@ -200,15 +158,6 @@ class SwarmNode(AgentsNode):
             self._publish_odometry(entry, self.swarm, entry[0], slot)
         self.swarm.fly(slot)
         return True
-
-    def _receive_frames(self, message: Fields, slot: int) -> None:
-        """Hand the agents the frames that the air carried in a slot."""
-        count = len(message.sender)
-        if not count:
-            self.agents.on_frames(slot, (), (), self._no_frames)
-            return
-        received = unpack_received(message.received, count, self.config.agents)
-        self.agents.on_frames(slot, message.sender, split_frames(message.data, message.length), received)
 
     def _answer(self, slot: int, senders: Sequence[int]) -> None:
         swarm, lengths = self.swarm, bytearray(len(self.ids))

@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from waiting import wait_for
 
 from dtsa_agent.air import crazyradio_port, device_port
-from dtsa_agent.air.crazyradio_dongle import BROADCAST, PacketReader, SnifferDongle, broadcast, datagram_in
+from dtsa_agent.air.crazyradio_packets import BROADCAST, PacketReader, broadcast, datagram_in
 from dtsa_agent.air.crazyradio_port import CrazyradioPort, DongleClock
-from dtsa_agent.air.device_port import DeviceError
-from dtsa_agent.air.port import check_fits, flight_ns, settings_class, trust_ns
+from dtsa_agent.air.port import check_fits, flight_ns, link_of, settings_class
 from dtsa_agent.air.settings import CrazyradioSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 
@@ -56,7 +55,7 @@ def test_a_sealed_frame_fills_the_packet_and_others_have_room_for_two_bytes() ->
     bits = 73 + 8 * (2 + SEALED.frame_length)
     assert flight_ns(SEALED, properties) == 1_100_000 + bits * 500
     assert flight_ns(SEALED, slow) == 1_100_000 + bits * 1000
-    assert trust_ns(SEALED, properties) == SEALED.slot_ns // 4, "a wrong send_time_ns is no other time"
+    assert link_of(SEALED, properties).trust_ns == SEALED.slot_ns // 4, "a wrong send_time_ns is no other time"
     with pytest.raises(ConfigError, match="slot_ms"):
         check_fits(SwarmConfig(agents=5, policy="lease", slot_ms=9.9), properties)
 
@@ -208,12 +207,11 @@ def usb_error(number: int) -> Any:
 def test_a_dongle_is_told_channel_rate_address_and_mode(plugged: list[Any]) -> None:
     device = FakeDevice()
     plugged.append(device)
-    dongle = SnifferDongle(CrazyradioSettings(uri="radio://51d0000000/42/1M"))
-    assert device.requests == [(0x24, 0, b""), (0x01, 42, b""), (0x03, 1, b""), (0x02, 0, BROADCAST), (0x24, 1, b"")]
-    dongle.write(broadcast(bytes(60), 7))
-    dongle.write(broadcast(bytes(57), 7))
+    with CrazyradioPort(CrazyradioSettings(uri="radio://51d0000000/42/1M")) as opened:
+        told = [(0x24, 0, b""), (0x01, 42, b""), (0x03, 1, b""), (0x02, 0, BROADCAST), (0x24, 1, b"")]
+        assert device.requests == told
+        assert opened.send(bytes(60)) == opened.send(bytes(57)) == ""
     assert [len(one) for one in device.written] == [67, 64, 0], "a transfer ends with a shorter packet, be it empty"
-    dongle.close()
     assert device.requests[-1] == (0x24, 0, b"")
 
 
@@ -228,7 +226,7 @@ def test_dongles_that_cannot_be_used_are_one_line(plugged: list[Any], device: An
     if device is not None:
         plugged.append(device)
     with pytest.raises(ConfigError) as error:
-        SnifferDongle(CrazyradioSettings(uri=URI))
+        CrazyradioPort(CrazyradioSettings(uri=URI))
     assert error.value.field == "uri"
     assert allowed in str(error.value)
     assert "\n" not in str(error.value)
@@ -237,7 +235,7 @@ def test_dongles_that_cannot_be_used_are_one_line(plugged: list[Any], device: An
 def test_without_pyusb_a_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="pip install pyusb"):
-        SnifferDongle(CrazyradioSettings(uri=URI))
+        CrazyradioPort(CrazyradioSettings(uri=URI))
 
 
 def test_what_a_dongle_hears_reaches_the_port_and_what_others_say_is_counted(plugged: list[Any]) -> None:
@@ -289,6 +287,4 @@ def test_a_dongle_that_does_not_take_a_packet_is_a_refusal(plugged: list[Any]) -
     plugged.append(device)
     with CrazyradioPort(CrazyradioSettings(uri=URI)) as opened:
         assert "it does not" in opened.send(b"mine")
-    with pytest.raises(DeviceError):
-        SnifferDongle(CrazyradioSettings(uri=URI)).write(b"x")
-    assert "crazyradio" not in {thread.name for thread in threading.enumerate()}
+    assert "dongle" not in {thread.name for thread in threading.enumerate()}

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.air.port import link_of
-from dtsa_agent.air.reports import Reports
+from dtsa_agent.air.record import Reports
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 from dtsa_agent.core.station import ALL_BUT_ONE, FLIES, IS_NEW, NO_QUORUM, STATES, Station, StationSettings

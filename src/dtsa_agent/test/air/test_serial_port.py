@@ -79,7 +79,7 @@ def test_bytes_without_end_are_not_kept() -> None:
     for _ in range(1000):
         assert not list(reader.feed(b"x" * 4096))
     assert reader.garbled_bytes > 4_000_000
-    assert len(reader._piece) <= LONGEST + 10
+    assert len(reader._rest) <= LONGEST + 10
     assert [datagram for datagram, _ in reader.feed(to_line(b"again"))] == [b"again"]
 
 

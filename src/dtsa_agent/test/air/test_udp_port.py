@@ -19,8 +19,7 @@ import pytest
 
 from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.port import ClockMap, ReceivedDatagram, link_of
-from dtsa_agent.air.record import AgentCounts, SlotRecord
-from dtsa_agent.air.reports import Reports
+from dtsa_agent.air.record import AgentCounts, Reports, SlotRecord
 from dtsa_agent.air.settings import AgentSettings, UdpSettings
 from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, Frame, Swarm, SwarmConfig, encode_frame

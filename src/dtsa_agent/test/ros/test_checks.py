@@ -6,6 +6,7 @@ import math
 import signal
 import subprocess
 from array import array
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock, call
@@ -22,7 +23,7 @@ from nav_msgs.msg import Odometry
 
 from dtsa_agent.ros.common import checks
 from dtsa_agent.ros.common.checks import RANGE, SIZES, SLOT, UNKNOWN, BadMessage, Intake, PublisherGuard, check_slot
-from dtsa_agent.ros.common.runs import Call, ProcessName, Run
+from dtsa_agent.ros.common.runs import Call, Run
 
 HEARD = {"sender": [2, 12], "length": [2, 1], "data": [1, 2, 3], "received": [1, 2, 3, 4]}
 
@@ -87,27 +88,28 @@ def test_only_the_channel_can_end_its_run() -> None:
     assert call.ended_by(run.proof)
     assert not call.ended_by(Run.draw().proof)
     assert not call.ended_by(b"")
-    assert not call.channel.has_ended
-    assert not ProcessName(call.channel.node, "elsewhere", 1, 1).has_ended
-    assert ProcessName(call.channel.node, call.channel.machine, call.channel.pid, call.channel.started + 1).has_ended
+    assert not call.has_ended
+    assert not replace(call, machine="elsewhere").has_ended
+    assert replace(call, started=call.started + 1).has_ended
 
 
 def test_a_stopped_process_is_paused_and_not_gone() -> None:
+    call = Call.from_bytes(Run.draw().call("/swarm/channel"))
     with subprocess.Popen(["sleep", "60"]) as process:
         fields = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").split()
-        name = ProcessName("/swarm/channel", ProcessName.own("").machine, process.pid, int(fields[21]))
+        call = replace(call, pid=process.pid, started=int(fields[21]))
         try:
-            assert not name.is_paused
-            assert not name.has_ended
+            assert not call.is_paused
+            assert not call.has_ended
             process.send_signal(signal.SIGSTOP)
-            wait_for(lambda: name.is_paused)
-            assert not name.has_ended
-            assert not ProcessName(name.node, name.machine, name.pid, name.started + 1).is_paused
+            wait_for(lambda: call.is_paused)
+            assert not call.has_ended
+            assert not replace(call, started=call.started + 1).is_paused
         finally:
             process.kill()
-        wait_for(lambda: name.has_ended)
-        assert not name.is_paused
-    assert not ProcessName(name.node, "elsewhere", name.pid, name.started).is_paused
+        wait_for(lambda: call.has_ended)
+        assert not call.is_paused
+    assert not replace(call, machine="elsewhere").is_paused
 
 
 @given(

@@ -34,7 +34,7 @@ def test_slots_of_different_agents_are_told_apart_and_what_was_heard_once() -> N
             swarm.score[:] = slot + index / 8
             reporter.add_slot(index, slot, 1000 * slot - index, index, swarm)
     for index in (0, 2):
-        reporter.add_received(index, 7, 1, 2, 20_000_000)
+        reporter.add_received(index, 7, 1, 2)
     reporter.publish(9, 4)
     reporter.publish(9, 5)
     told = [(report.agent.tolist(), report.slot.tolist()) for report in reports]
@@ -55,7 +55,7 @@ def test_slots_of_different_agents_are_told_apart_and_what_was_heard_once() -> N
 def test_what_was_heard_is_told_even_if_nobody_has_begun_a_slot() -> None:
     reporter, reports = make_reporter()
     reporter.add_slot(1, 4, 0, 0, Swarm(CONFIG, local=[IDS[1]]))
-    reporter.add_received(1, 7, 3, 3, 30_000_000)
+    reporter.add_received(1, 7, 3, 3)
     reporter.publish(9, 4)
     alone, everybody = reports
     assert (alone.agent.tolist(), alone.heard_sender.tolist()) == ([5], [])

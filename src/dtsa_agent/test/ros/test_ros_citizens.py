@@ -1,10 +1,9 @@
-"""Integration: nodes among other nodes: logs, namespaces, ordinary executors, names of frames."""
+"""Integration: nodes among other nodes: logs, namespaces, names of frames."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,21 +14,17 @@ from node_helpers import Graph, end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_msgs.msg import Configuration, RunStatus, Slot, Transmission
+from dtsa_msgs.msg import Configuration, RunStatus, Slot
 from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import DescribeParameters, GetParameters
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.task import Future
 
-from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.errors import ConfigError, LocalProtocolError
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.node_process import log_where_possible
 from dtsa_agent.ros.common.parameters import check_parameters
 from dtsa_agent.ros.common.runs import WaitingLog
-from dtsa_agent.ros.swarm_node import SwarmNode
 
 AGENT, HOST, CHANNEL = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host", "dtsa_channel_sim.ros.channel_node"
 
@@ -152,55 +147,3 @@ def test_late_subscribers_get_settings_and_status(graph: Graph) -> None:
     assert status[-1].slot > 0
     assert end_of(channel)[0] == 0
     assert end_of(host)[0] == 0
-
-
-@contextmanager
-def attached_agents(graph: Graph, space: str) -> Iterator[tuple[SwarmNode, Future, Callable[[], None]]]:
-    node = Node("agents", context=graph.node.context, enable_rosout=False, start_parameter_services=False)
-    agents = SwarmNode(node, Swarm(SwarmConfig(agents=2)), space)
-    executor = SingleThreadedExecutor(context=graph.node.context)
-    executor.add_node(node)
-    yield agents, agents.attach(), lambda: executor.spin_once(timeout_sec=0.05)
-    executor.shutdown()
-    agents.loop.close()
-    node.destroy_node()
-
-
-def answers_in(graph: Graph, space: str, attached: bool) -> list[list[object]]:
-    """What two agents answer in a run of 30 slots: served by an ordinary executor, or in a process of their own."""
-    given: list[Transmission] = []
-    heard = graph.node.create_subscription(Transmission, f"{space}/transmission", given.append, names.lockstep_qos(64))
-    swarm = ["-r", f"__ns:={space}", "-p", "agents:=2"]
-
-    def start_channel() -> None:
-        graph.until(heard.get_publisher_count)  # or the test would miss the first answers
-        graph.start(CHANNEL, *swarm, "-p", "slots:=30", "-p", "loss:=0.3")
-
-    if not attached:
-        process = graph.start(HOST, *swarm)
-        start_channel()
-        graph.until(lambda: process.poll() is not None)
-    else:
-        with attached_agents(graph, space) as (_, over, serve):
-            start_channel()
-            graph.until(over.done, serve)
-            assert over.exception() is None
-    graph.until(lambda: given and given[-1].slot == 30)
-    by_slot = {m.slot: [m.slot, list(m.data), list(m.chosen), list(m.digest), list(m.track)] for m in given}
-    return [by_slot[slot] for slot in range(31)]
-
-
-@pytest.mark.ros
-def test_agents_in_an_ordinary_executor_answer_the_same(graph: Graph) -> None:
-    assert answers_in(graph, "/attached", True) == answers_in(graph, "/looped", False)
-
-
-@pytest.mark.ros
-def test_an_error_of_attached_agents_is_in_the_future(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone(*unused: object) -> None:
-        raise LocalProtocolError("the channel has gone")
-
-    with attached_agents(graph, "/attached") as (agents, over, serve):
-        monkeypatch.setattr(agents.membership, "idle", gone)
-        graph.until(over.done, serve)
-        assert isinstance(over.exception(), LocalProtocolError)

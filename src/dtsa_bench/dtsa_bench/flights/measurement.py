@@ -14,7 +14,7 @@ from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import FlightMetrics, metrics_tables
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
-from dtsa_channel_sim.ros.observer import ChannelObserver, Referee
+from dtsa_channel_sim.ros.observer import ChannelObserver
 
 _MAX_PATH_BYTES = 1 << 24
 
@@ -40,8 +40,8 @@ class FlightPath:
         return np.array(self._kept).reshape(-1, 3, self._agents)
 
 
-class FlightMeasurement(ChannelObserver, Referee):
-    """Follows a flight with the metrics; as its referee, ends it when they say so."""
+class FlightMeasurement(ChannelObserver):
+    """Follows a flight with the metrics, and knows when they say that it is over."""
 
     def __init__(self, run: RunConfig, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -75,11 +75,8 @@ class FlightMeasurement(ChannelObserver, Referee):
         if self.metrics.update(slot - 1, answers.track, self.tables, self._outcome, self._lengths):
             self.end_s = time.monotonic()
 
-    def over(self, slot: int, answers: Answers) -> bool:
-        return bool(self.metrics.end)
-
-    @property
-    def reason(self) -> str:
+    def over(self) -> str:
+        """Why the flight is over; empty: it goes on."""
         return str(self.metrics.end or "")
 
     def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:

@@ -57,15 +57,15 @@ class RecordedFlight:
         self.run_config, self.directory = run, directory
         self.scenario = make_scenario(run.swarm)
         self.measurement = FlightMeasurement(run, self.scenario)
-        model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
+        model, steps, over = Channel(run.air), run.swarm.steps, self.measurement.over
         self.run_id = identity.number
         limits: dict[str, Any] = {
             "startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed, "swarm_namespace": space,
         }  # fmt: skip
         self.channel: LockstepChannel | RealtimeChannel = (
-            LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
+            LockstepChannel(node, model, steps, answer_s, over=over, **limits)
             if run.mode == LOCKSTEP
-            else RealtimeChannel(node, model, steps, referee=referee, **limits)
+            else RealtimeChannel(node, model, steps, over=over, **limits)
         )
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(

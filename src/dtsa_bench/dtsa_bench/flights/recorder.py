@@ -37,7 +37,7 @@ _REPORTED = ("chosen", "reason", "digest", "score", "offset_ns", "track", "veloc
 
 
 class FlightRecorder(ChannelObserver):
-    """Writes a flight into a bag, slot after slot; see docs/reference/bag.md for topics and times.
+    """Writes a flight into a bag, slot after slot; see docs/reference/nodes.md for topics and times.
 
     A slot counts as flown once all agents have told where it took them, in their answers to the next one. What a flight
     that is cut short leaves half done does not get into its bag.
@@ -57,7 +57,7 @@ class FlightRecorder(ChannelObserver):
         self._event = 0
         spaces = [names.agent_namespace(agent) for agent in range(1, agents + 1)]
         self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
-        self._packer = OdometryPacker([names.body_frame(space) for space in spaces], names.FRAME)
+        self._packer = OdometryPacker([names.body_frame(space) for space in spaces])
         self._accounts = None if run.mode == LOCKSTEP else RealtimeAccounts(agents, self._steps, self._slot_ns)
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1
@@ -83,8 +83,7 @@ class FlightRecorder(ChannelObserver):
         self._complete = slot
         self._answered[:], self._track[:] = answers.answered, answers.track
         if not slot:
-            self._state.phase = RunStatus.FLYING
-            self._write_status()
+            self._write_status(phase=RunStatus.FLYING)
 
     def agent_silent(self, agent: int) -> None:
         self._state.lose(agent)
@@ -100,12 +99,12 @@ class FlightRecorder(ChannelObserver):
         self._write_status()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
-        self._state.phase, self._state.reason = RunStatus.ENDED, reason
+        self._state.reach(self._complete, phase=RunStatus.ENDED, reason=reason)
 
-    def _write_status(self) -> None:
-        self._state.slot = max(0, self._complete)
-        at = self._time_ns(self._state.slot)
-        self.bag.write(self._status, bytes(serialize_message(self._state.message())), at, at)
+    def _write_status(self, **changed: Any) -> None:
+        self._state.reach(self._complete, **changed)
+        at = self._time_ns(max(0, self._complete))
+        self.bag.write(self._status, bytes(serialize_message(self._state.message)), at, at)
 
     def _write_pending(self) -> None:
         """Write all about the slot before the last one that was answered."""

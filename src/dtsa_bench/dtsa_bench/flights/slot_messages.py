@@ -44,7 +44,7 @@ class SlotMessages:
         self._agents = scenario.start.shape[1]
         self._ids = array("H", range(1, self._agents + 1)).tobytes()
         self.view_slots = max(1, round(_VIEW_NS / slot_ns))
-        self._markers = MarkerPacker([f"cf{agent}" for agent in range(1, self._agents + 1)])
+        self._markers = MarkerPacker(range(1, self._agents + 1))
 
     def decision(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
         """A dtsa_msgs/Decision; it names the reasons that agents have."""

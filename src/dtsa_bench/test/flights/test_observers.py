@@ -34,7 +34,7 @@ from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
-from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus, ObserverError, Observers, SlotLimit
+from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus, ObserverError, Observers
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 Sender = TypeVar("Sender", bound="LateSender")
@@ -102,7 +102,7 @@ def test_a_channel_needs_no_observer_and_a_slot_is_told_in_order(tmp_path: Path)
         host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=3")
         for observers in ((), (Diary(pages),)):
             node = Node("channel", context=graph.node.context, enable_rosout=False)
-            channel = LockstepChannel(node, Channel(ChannelConfig(agents=3)), 1, referee=SlotLimit(2))
+            channel = LockstepChannel(node, Channel(ChannelConfig(agents=3)), 1, slots=2)
             channel.observe(*observers)
             try:
                 channel.run(stop=False)
@@ -194,7 +194,7 @@ def flown_with(kind: type[Sender], folder: Path, slots: int) -> tuple[RealtimeCh
     """The channel of a flight in real time of two agents for whom an observer answers, and that observer."""
     with ros_graph(folder) as graph:
         node = Node("channel", context=graph.node.context, enable_rosout=False)
-        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, referee=SlotLimit(slots))
+        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, slots=slots)
         observer = kind(graph.node, channel)
         channel.observe(observer)
         try:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 REPRESENTATION = b"\x00\x01\x00\x00"  # stands before each body: plain CDR, little endian
 _FRAME = (4, b"map\0")  # frame_id of a header: length and text
 SECOND = 1_000_000_000  # ns
-_HEADER = 16  # bytes of a header in that frame
+_HEADER, _HEADER_VALUES = 16, 5  # bytes of a header in that frame, and values of a struct with the representation
 _COUNT = struct.Struct("<I")
 _MOST_KEPT = 512  # layouts of messages of a kind
 
@@ -45,31 +45,31 @@ class CdrMessage:
         #: Of the elements, as NumPy has it, by field.
         self.kinds = tuple(f"<{code[-1]}" for code in self._codes)
         self._sizes = tuple(struct.calcsize(kind) for kind in self.kinds)
-        sequences = [at for at, code in enumerate(self._codes) if code[0] == "*"]
-        self._sequences_of = itemgetter(*sequences)
+        self._sequences_of = itemgetter(*(at for at, code in enumerate(self._codes) if code[0] == "*"))
         # A header is five of a struct's values, a number one, a sequence two: number of elements, and these.
-        values = [5 + at + sum(before <= at for before in sequences) for at in range(len(self._codes))]
-        counts = [values[at] - 1 for at in sequences]
+        place, values, counts = _HEADER_VALUES, [], []
+        for code in self._codes:
+            if code[0] == "*":
+                counts.append(place)
+                place += 1
+            values.append(place)
+            place += 1
         self._values_of, self._fixed_of = itemgetter(1, 2, *values), itemgetter(0, 3, 4, *counts)
-        given = [0, 1, 2, 3, 4, *values, *counts]
-        self._in_order = itemgetter(*(given.index(place) for place in range(len(given))))
+        self._in_order = itemgetter(*np.argsort([*range(_HEADER_VALUES), *values, *counts]).tolist())
         self._layout = lru_cache(_MOST_KEPT)(self._make_layout)
         self._known: dict[int, tuple[struct.Struct, tuple[Any, ...]]] = {}  # by the message's length
 
     def _make_layout(self, lengths: Sequence[int]) -> tuple[struct.Struct, tuple[int, ...]]:
         """Return a struct for sequences of these lengths (bytes), and how many elements they have."""
-        layout, end, left, counts = "<4siII4s", _HEADER, iter(lengths), []
+        layout, left, counts = "<4siII4s", iter(lengths), []
         for code, size in zip(self._codes, self._sizes, strict=True):
             if code[0] == "*":
                 length = next(left)
                 counts.append(length // size)
-                count = _gap(end, _COUNT.size) + "I"
-                end += struct.calcsize(f"<{count}")
-                elements = (_gap(end, size) if length else "") + f"{length}s"
+                layout += _gap(layout, _COUNT.size) + "I"
+                layout += (_gap(layout, size) if length else "") + f"{length}s"
             else:
-                count, elements = "", _gap(end, size) + code
-            end += struct.calcsize(f"<{elements}")
-            layout += count + elements
+                layout += _gap(layout, size) + code
         return struct.Struct(layout), tuple(counts)
 
     def pack(self, time_ns: int, values: Sequence[Any]) -> bytes:
@@ -106,24 +106,20 @@ class CdrMessage:
     def _lengths(self, data: bytes) -> tuple[int, ...] | None:
         """Return the bytes of each sequence; None if the message ends before them. rclpy leaves bytes behind them."""
         body, at, lengths = memoryview(data)[len(REPRESENTATION) :], _HEADER, []
-        try:
-            for code, size in zip(self._codes, self._sizes, strict=True):
-                if code[0] == "*":
-                    at += -at % _COUNT.size
-                    (count,) = _COUNT.unpack_from(body, at)
-                    lengths.append(count * size)
-                    at += _COUNT.size
-                    at += (-at % size if count else 0) + count * size
-                else:
-                    at += -at % size + size
-        except struct.error:
-            return None
+        for code, size in zip(self._codes, self._sizes, strict=True):
+            if code[0] == "*":
+                at += -at % _COUNT.size + _COUNT.size
+                count = int.from_bytes(body[at - _COUNT.size : at], "little")
+                lengths.append(count * size)
+                at += (-at % size if count else 0) + count * size
+            else:
+                at += -at % size + size
         return tuple(lengths) if at <= len(body) else None
 
 
-def _gap(end: int, size: int) -> str:
-    """Return what stands in a struct between the end of a field and one that is aligned to its size."""
-    return "x" * (-end % size)
+def _gap(layout: str, size: int) -> str:
+    """Return what stands in a struct between what it has so far and a field that is aligned to its size."""
+    return "x" * (-(struct.calcsize(layout) - len(REPRESENTATION)) % size)
 
 
 # Covariances are row-major 6 x 6 over (x, y, z, rotation about x, y, z), in m^2 and rad^2, (m/s)^2 and (rad/s)^2. Zeros
@@ -151,10 +147,7 @@ def pack_received(mask: NDArray[np.bool_]) -> bytes:
 
 
 def unpack_received(data: bytes | memoryview, frames: int, agents: int) -> NDArray[np.uint8]:
-    """Return the mask (F, N), 0 or 1, that :func:`pack_received` packed.
-
-    :raises ValueError: if the field's length does not fit.
-    """
+    """Return the mask (F, N), 0 or 1, that :func:`pack_received` packed; ValueError: the length does not fit."""
     rows = np.frombuffer(data, dtype=np.uint8).reshape(frames, (agents + 7) // 8)
     return np.unpackbits(rows, axis=1, count=agents, bitorder="little")
 
@@ -162,7 +155,7 @@ def unpack_received(data: bytes | memoryview, frames: int, agents: int) -> NDArr
 def split_frames(data: bytes | memoryview, lengths: Sequence[int]) -> list[bytes]:
     """Return the frames that lie one after the other in ``data``, by their lengths in bytes; 0 gives an empty one.
 
-    :raises ValueError: if the lengths do not add up to the data.
+    ValueError: the lengths do not add up to the data.
     """
     frames, at, whole = [], 0, bytes(data)
     for length in lengths:

@@ -5,10 +5,10 @@ A check raises :class:`BadMessage` with one of the reasons below; nothing else a
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -54,16 +54,16 @@ class Intake:
     def __init__(self, logger: Any = None) -> None:
         self._logger = logger
         self._next_line_s = 0.0
-        self.counts: dict[str, int] = {}  # by reason
+        self.counts: Counter[str] = Counter()  # by reason
 
     @property
     def total(self) -> int:
         """Number of all messages dropped."""
-        return sum(self.counts.values())
+        return self.counts.total()
 
     def drop(self, reason: str, detail: str) -> None:
         """Count a message."""
-        self.counts[reason] = self.counts.get(reason, 0) + 1
+        self.counts[reason] += 1
         now = time.monotonic()
         if self._logger is not None and now >= self._next_line_s:
             self._next_line_s = now + _LOG_S
@@ -108,27 +108,21 @@ class PublisherGuard:
 
 def check_slot(message: Any, agents: int) -> None:
     """Check that the fields of a dtsa_msgs/Slot fit together, for N agents."""
-    phase, senders, lengths, received = message.phase, message.sender, message.length, message.received
-    count = len(senders)
+    phase, count, lengths, received = message.phase, len(message.sender), message.length, len(message.received)
     if phase > Slot.REFUSE:
         raise BadMessage(RANGE, f"slot message of phase {phase}")
     if (message.slot > LARGEST_SLOT and phase != Slot.PREPARE) or message.heard_slot > LARGEST_SLOT:
         raise BadMessage(SLOT, f"slot message for slot {message.slot}")
-    if phase != Slot.RUN:
-        if count or len(lengths) or len(received):
-            raise BadMessage(SIZES, f"slot message of phase {phase} with frames")
-        return
-    if count == 0:
-        if len(lengths) or len(message.data) or len(received):
-            raise BadMessage(SIZES, "slot message with frames of no agent")
-        return
-    if len(lengths) != count or len(received) != count * ((agents + 7) // 8):
-        detail = f"{count} senders, {len(lengths)} lengths, {len(received)} bytes of receivers"
-        raise BadMessage(SIZES, f"slot message: {detail}")
-    check_frames(lengths, message.data)
-    if not all(lengths):
-        raise BadMessage(SIZES, "slot message with an empty frame")
-    check_ids(senders, agents, ascending=False)
+    if phase != Slot.RUN and (count or len(lengths) or received):
+        raise BadMessage(SIZES, f"slot message of phase {phase} with frames")
+    if len(lengths) != count or received != count * ((agents + 7) // 8):
+        raise BadMessage(SIZES, f"slot message: {count} senders, {len(lengths)} lengths, {received} bytes of receivers")
+    if phase == Slot.RUN:
+        check_frames(lengths, message.data)
+    if count:
+        if not all(lengths):
+            raise BadMessage(SIZES, "slot message with an empty frame")
+        check_ids(message.sender, agents, ascending=False)
 
 
 def check_frames(lengths: Sequence[int], data: Any) -> None:
@@ -141,11 +135,11 @@ def check_frames(lengths: Sequence[int], data: Any) -> None:
 
 def check_ids(ids: Sequence[int], agents: int, ascending: bool = True) -> None:
     """Check that ids are those of different agents of N, one at least, and in order if they have to be."""
-    count = len(ids)
-    if not count or count > agents or min(ids) < 1 or max(ids) > agents:
-        raise BadMessage(UNKNOWN, f"a message for agents {list(ids[:8])}; allowed: 1 to {agents}")
-    if count > 1 and (len(set(ids)) != count or (ascending and any(a >= b for a, b in itertools.pairwise(ids)))):
-        raise BadMessage(UNKNOWN, f"a message for agents {list(ids[:8])}, twice or out of order")
+    given, distinct = list(ids), sorted(set(ids))
+    if not given or distinct[0] < 1 or distinct[-1] > agents:
+        raise BadMessage(UNKNOWN, f"a message for agents {given[:8]}; allowed: 1 to {agents}")
+    if distinct != (given if ascending else sorted(given)):
+        raise BadMessage(UNKNOWN, f"a message for agents {given[:8]}, twice or out of order")
 
 
 def check_numbers(name: str, values: Iterable[float], largest: float = FARTHEST_M) -> None:
@@ -186,10 +180,7 @@ def check_odometry(message: Odometry) -> None:
 
 
 def parse_json(data: bytes | str) -> Any:
-    """Return what a text of JSON holds.
-
-    :raises ValueError: for any other text, one too deep included.
-    """
+    """Return what a text of JSON holds; ValueError: it is another text, or too deep."""
     try:
         return json.loads(data)
     except RecursionError:

@@ -44,12 +44,6 @@ class _NoExecutor(CallbackGroup):
     def can_execute(self, entity: Any) -> bool:
         return False
 
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
-
 
 # Who sent a message: rclpy knows, but hands it out with no message. So one function of rcl is called through ctypes,
 # with the message information that it fills in. With another middleware or distribution there is no sender.
@@ -94,45 +88,6 @@ def _libraries() -> tuple[Any, Any] | None:
     return rcl, rcutils
 
 
-class Taker:
-    """Pops the messages of one subscription; its handle, rclpy's, has to be held open meanwhile."""
-
-    def __init__(self, handle: Any) -> None:
-        self.sender: bytes | None = None  # participant that sent the last message; None: not known
-        self._handle, self._libraries = handle, _libraries()
-        if self._libraries is not None:
-            rcl, rcutils = self._libraries
-            self._bytes, self._information = _Bytes(), _Information()
-            allocator = rcutils.rcutils_get_default_allocator()
-            rcutils.rcutils_uint8_array_init(ctypes.byref(self._bytes), _FIRST_BYTES, ctypes.byref(allocator))
-            self._take, self._reset = rcl.rcl_take_serialized_message, rcutils.rcutils_reset_error
-            self._arguments = handle.pointer, ctypes.addressof(self._bytes), ctypes.addressof(self._information), None
-            self._sender_at = ctypes.addressof(self._information) + _Information.publisher.offset
-
-    def take(self) -> bytes | None:
-        """Return a message that is there already, as CDR, or None.
-
-        :raises RuntimeError: if rcl cannot take it.
-        """
-        if self._libraries is None:
-            taken = self._handle.take_message(None, True)
-            return None if taken is None else bytes(taken[0])
-        code = self._take(*self._arguments)
-        if code:
-            if code == _TAKE_FAILED:
-                return None
-            self._reset()
-            raise RuntimeError(f"rcl error {code}")
-        self.sender = ctypes.string_at(self._sender_at, _PARTICIPANT_BYTES)
-        return ctypes.string_at(self._bytes.buffer, self._bytes.length)
-
-    def close(self) -> None:
-        """Free the buffer."""
-        if self._libraries is not None:
-            self._libraries[1].rcutils_uint8_array_fini(ctypes.byref(self._bytes))
-            self._take = lambda *arguments: _TAKE_FAILED
-
-
 class Feed:
     """A subscription whose messages are read by its owner, at its own time.
 
@@ -147,6 +102,7 @@ class Feed:
         intake: Intake | None = None, admits: Callable[[Any, bytes | None], bool] | None = None,
         read: Callable[[bytes], Any] | None = None,
     ) -> None:  # fmt: skip
+        self.sender: bytes | None = None  # participant of DDS, a process, that sent the last message; None: not known
         self.subscription = node.create_subscription(
             msg_type, topic, self._refuse, qos, callback_group=_NoExecutor(), raw=True
         )
@@ -155,23 +111,40 @@ class Feed:
         self._read = read or (bytes if raw else partial(deserialize_message, message_type=msg_type))
         self._stack = ExitStack()
         self._stack.enter_context(self.handle)
-        self._taker = Taker(self.handle)
-        self._stack.callback(self._taker.close)
-
-    @property
-    def sender(self) -> bytes | None:
-        """Participant of DDS, which is a process, that sent the last message; None: not known."""
-        return self._taker.sender
+        self._libraries = _libraries()
+        if self._libraries is not None:
+            rcl, rcutils = self._libraries
+            self._bytes, self._information = _Bytes(), _Information()
+            allocator = rcutils.rcutils_get_default_allocator()
+            rcutils.rcutils_uint8_array_init(ctypes.byref(self._bytes), _FIRST_BYTES, ctypes.byref(allocator))
+            self._stack.callback(rcutils.rcutils_uint8_array_fini, ctypes.byref(self._bytes))
+            self._take, self._reset = rcl.rcl_take_serialized_message, rcutils.rcutils_reset_error
+            places = map(ctypes.addressof, (self._bytes, self._information))
+            self._arguments = self.handle.pointer, *places, None
+            self._sender_at = ctypes.addressof(self._information) + _Information.publisher.offset
 
     def _refuse(self, message: Any) -> None:
         raise LocalProtocolError("an executor took a message that is not its own")
 
+    def _take_bytes(self) -> bytes | None:
+        """Return a message that is there already, as CDR, or None. RuntimeError: rcl cannot take it."""
+        if self._libraries is None:
+            taken = self.handle.take_message(None, True)
+            return None if taken is None else bytes(taken[0])
+        code = self._take(*self._arguments)
+        if code:
+            if code == _TAKE_FAILED:
+                return None
+            self._reset()
+            raise RuntimeError(f"rcl error {code}")
+        self.sender = ctypes.string_at(self._sender_at, _PARTICIPANT_BYTES)
+        return ctypes.string_at(self._bytes.buffer, self._bytes.length)
+
     def take(self) -> Any:
         """Return a message that is there already, or None; also None after many that were not received."""
-        taker = self._taker
         for _ in range(_MOST_DROPPED):
             try:
-                data = taker.take()
+                data = self._take_bytes()
                 if data is None:
                     return None
                 message = self._read(data)
@@ -180,12 +153,12 @@ class Feed:
                     raise
                 self._intake.drop(UNREADABLE, f"no {self._type.__name__}: {(str(error).splitlines() or [''])[0]}")
                 continue
-            if self._admits is None or self._admits(message, taker.sender):
+            if self._admits is None or self._admits(message, self.sender):
                 return message
         return None
 
     def close(self) -> None:
-        """Give the handles back."""
+        """Give the handles back; no message is taken afterwards."""
         self._stack.close()
 
 
@@ -244,6 +217,7 @@ class Loop(Feed):
             if self._executor is None:
                 self._executor = SingleThreadedExecutor(context=self._node.context)
                 self._executor.add_node(self._node)
+                self._stack.callback(self._executor.shutdown, timeout_sec=0)
             for _ in range(2):
                 self._executor.spin_once(timeout_sec=0.0)
         return True
@@ -258,12 +232,6 @@ class Loop(Feed):
                 idle()
             if not self._node.context.ok():
                 raise ExternalShutdownException
-
-    def close(self) -> None:
-        """Give the handles back."""
-        if self._executor is not None:
-            self._executor.shutdown(timeout_sec=0)
-        super().close()
 
 
 class ExecutorThread:

@@ -64,7 +64,7 @@ class MessageType(CdrMessage):
         })  # fmt: skip
 
     def pack_fields(self, time_ns: int, **fields: Any) -> bytes:
-        """Return a message as CDR, by its fields: numbers, and bytes of sequences."""
+        """Return a message as CDR by its fields: numbers, and bytes of sequences."""
         return self.pack(time_ns, [fields[name] for name in self.fields])
 
 

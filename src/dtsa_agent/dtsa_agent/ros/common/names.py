@@ -60,16 +60,16 @@ def slot_time_ns(slot: int, slot_ns: int) -> int:
 
 def latched_qos() -> Any:
     """The last message, for late subscribers too."""
-    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+    from rclpy.qos import DurabilityPolicy, QoSProfile
 
-    return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # reliable, as by default
 
 
 def lockstep_qos(writers: int = 1) -> Any:
     """Nothing may be lost on the way; a reader's history is shared by all nodes that write to the topic."""
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from rclpy.qos import QoSProfile
 
-    return QoSProfile(depth=4 * writers, reliability=ReliabilityPolicy.RELIABLE)  # keeps the last, volatile
+    return QoSProfile(depth=4 * writers)  # reliable, keeps the last, volatile
 
 
 def agent_names(ids: Iterable[int]) -> str:

@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.exceptions import InvalidNamespaceException, InvalidParameterTypeException
+from rclpy.exceptions import InvalidNamespaceException
 from rclpy.node import Node
 from rclpy.validate_namespace import validate_namespace
 
@@ -24,7 +24,6 @@ from . import names
 
 _UNBOUNDED = 2.0**62
 _NOTHING = -1  # stands for None in a parameter that may be left open
-_AGENT = re.compile(r"(?P<swarm>.*)/cf\d+")
 
 
 def descriptor(setting: Setting, read_only: bool) -> ParameterDescriptor:
@@ -39,12 +38,11 @@ def descriptor(setting: Setting, read_only: bool) -> ParameterDescriptor:
         result.integer_range = [IntegerRange(from_value=int(low), to_value=min(int(high), 2**63 - 1), step=0)]
     elif setting.kind == "float":
         result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)]
-        result.dynamic_typing = True  # `-p slot_ms:=10` shall do as well as 10.0
     elif setting.kind == "vector":
-        result.dynamic_typing = True
         result.additional_constraints = setting.allowed
     elif setting.choices:
         result.additional_constraints = "one of: " + ", ".join(setting.choices)
+    result.dynamic_typing = setting.kind in ("float", "vector")  # `-p slot_ms:=10` shall do as well as 10.0
     return result
 
 
@@ -73,22 +71,23 @@ def declare_setting(node: Node, setting: Setting, prefix: str = "", read_only: b
     """Declare one parameter; as :func:`declare_settings`."""
     name = prefix + setting.name
     default = _NOTHING if setting.default is None else to_parameter(setting, setting.default)
-    try:
-        parameter = node.declare_parameter(name, default, descriptor(setting, read_only))
-    except Exception as error:  # rclpy has no common base for wrong types and values out of range
-        given = node._parameter_overrides.get(name)
-        raise ConfigError(name, default if given is None else given.value, setting.allowed) from error
-    return from_parameter(setting, parameter.value)
+    value = _declare(node, name, default, descriptor(setting, read_only), setting.allowed)
+    return from_parameter(setting, value)
 
 
 def declare_list(node: Node, name: str, default: list[Any], description: str) -> list[Any]:
     """Declare a parameter that is a list of numbers of its default's kind; return its value, or raise as above."""
     kind = "whole numbers" if isinstance(default[0], int) else "numbers with a decimal point"
+    info = ParameterDescriptor(description=description, read_only=True)
+    return list(_declare(node, name, default, info, f"a list of {kind}, as {default}"))
+
+
+def _declare(node: Node, name: str, default: Any, info: ParameterDescriptor, allowed: str) -> Any:
     try:
-        info = ParameterDescriptor(description=description, read_only=True)
-        return list(node.declare_parameter(name, default, info).value)
-    except InvalidParameterTypeException:
-        raise ConfigError(name, node._parameter_overrides[name].value, f"a list of {kind}, as {default}") from None
+        return node.declare_parameter(name, default, info).value
+    except Exception as error:  # rclpy has no common base for wrong types and values out of range
+        given = node._parameter_overrides.get(name)
+        raise ConfigError(name, default if given is None else given.value, allowed) from error
 
 
 def check_parameters(node: Node) -> None:
@@ -128,10 +127,7 @@ def _sections(content: Any, place: str = "") -> Iterator[tuple[str, Mapping[str,
 
 
 def from_parameter(setting: Setting, value: Any) -> Any:
-    """Return the setting's value from that of its parameter.
-
-    :raises ConfigError: if it is none.
-    """
+    """Return the setting's value from that of its parameter; ConfigError: it is none."""
     if setting.optional and value == _NOTHING:
         return None
     if setting.kind == "values":
@@ -160,16 +156,12 @@ def to_parameters(values: Mapping[str, Any], cls: type[Settings]) -> dict[str, A
 
 
 def declare_swarm_namespace(node: Node) -> str:
-    """Declare the parameter ``swarm_namespace`` and return its value.
+    """Declare the parameter ``swarm_namespace`` and return its value; ConfigError: it is no namespace.
 
     Default is the namespace that the node was started in, without the agent's own part: a node in ``/north`` or in
     ``/north/cf3`` belongs to swarm ``/north``, one in ``/swarm`` or ``/cf3`` to ``/swarm``.
-
-    :raises ConfigError: if the value is no namespace.
     """
-    own = node.get_namespace()
-    agent = _AGENT.fullmatch(own)
-    default = (agent["swarm"] if agent else own.rstrip("/")) or names.SWARM
+    default = re.sub(r"/cf\d+$|/$", "", node.get_namespace()) or names.SWARM
     text = "namespace of what the whole swarm shares; default: the node's own, without the agent's part"
     setting = Setting("swarm_namespace", "text", default, text)
     value = declare_setting(node, setting)

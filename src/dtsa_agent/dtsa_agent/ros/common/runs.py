@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import time
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -21,34 +22,46 @@ _LONGEST_CHECK_S = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class ProcessName:
-    """A process as others name it in messages; it can be looked for on its machine."""
+class Call:
+    """What the agents learn about a run from its channel's call. Slot messages carry it as JSON.
 
-    node: str  # with the namespace
+    The channel's process can be looked for on its machine; of other machines nothing is known.
+    """
+
+    node: str  # the channel's, with its namespace
     machine: str  # its boot and its process namespace
     pid: int
     started: int  # clock ticks after the boot
+    end: str  # SHA-256 of the proof that the end shows, in hexadecimal digits
+    session: int  # of authenticated frames
 
     @classmethod
-    def own(cls, node: str) -> ProcessName:
-        """Return the name of this process, by its node's name with the namespace."""
-        return cls(node, _machine(), os.getpid(), _state(os.getpid())[1])
+    def from_bytes(cls, data: bytes) -> Call:
+        """Return the call that :meth:`Run.call` gave; ValueError: it is something else."""
+        given = parse_json(data) if len(data) <= _LONGEST else None
+        kinds = {name: type(value).__name__ for name, value in given.items()} if isinstance(given, dict) else None
+        if kinds != cls.__annotations__ or not 0 < given["session"] < _MOST_SESSIONS:
+            raise ValueError(f"{len(data)} bytes that are no call")
+        return cls(**given)
+
+    def ended_by(self, proof: bytes) -> bool:
+        """Whether the bytes that a message shows end the run."""
+        return len(proof) == _PROOF_BYTES and sha256(proof).hexdigest() == self.end
 
     @property
     def has_ended(self) -> bool:
-        """Whether the process has ended for sure. A stopped one has not; of other machines nothing is known."""
+        """Whether the channel's process has ended for sure. A stopped one has not."""
         state, started = self._state()
         return bool(state) and (started != self.started or state in "ZX")
 
     @property
     def is_paused(self) -> bool:
-        """Whether the process is there but stopped, by a signal or a debugger; of other machines nothing is known."""
+        """Whether the channel's process is there but stopped, by a signal or a debugger."""
         state, started = self._state()
         return state in ("T", "t") and started == self.started
 
     def _state(self) -> tuple[str, int]:
-        here = self.started and self.machine == _machine() and self.pid > 0
-        return _state(self.pid) if here else ("", 0)
+        return _state(self.pid) if self.started and self.machine == _machine() and self.pid > 0 else ("", 0)
 
 
 @cache
@@ -84,8 +97,6 @@ class Run:
     @classmethod
     def draw(cls, session: int = 0) -> Run:
         """Return a new one: no two runs share one. ``session``: of authenticated frames; 0: a random one."""
-        import secrets  # channels draw, agents do not
-
         proof = secrets.token_bytes(_PROOF_BYTES)
         return cls(secrets.randbelow(2**32 - 1) + 1, proof, session or secrets.randbelow(_MOST_SESSIONS - 1) + 1)
 
@@ -94,45 +105,9 @@ class Run:
 
     def call(self, node: str) -> bytes:
         """Return the call of a channel in this process, of a node of this name, as slot messages carry it."""
-        return Call(ProcessName.own(node), sha256(self.proof).hexdigest(), self.session).to_bytes()
-
-
-@dataclass(frozen=True, slots=True)
-class Call:
-    """What the agents learn about a run from its channel's call."""
-
-    channel: ProcessName
-    end: str  # SHA-256 of the proof that the end shows, in hexadecimal digits
-    session: int  # of authenticated frames
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Call:
-        """Return the call that :meth:`to_bytes` wrote.
-
-        :raises ValueError: for anything else.
-        """
-        if len(data) > _LONGEST:
-            raise ValueError(f"a call of {len(data)} bytes")
-        given = parse_json(data)
-        kinds = {"node": str, "machine": str, "pid": int, "started": int, "end": str, "session": int}
-        if not isinstance(given, dict) or set(given) != set(kinds):
-            raise ValueError("not a call")
-        for name, kind in kinds.items():
-            if type(given[name]) is not kind:
-                raise ValueError(f"{name} of a call: {given[name]!r:.40}")
-        end, session = given.pop("end"), given.pop("session")
-        if not 0 < session < _MOST_SESSIONS:
-            raise ValueError(f"session {session} of a call")
-        return cls(ProcessName(**given), end, session)
-
-    def to_bytes(self) -> bytes:
-        """Return the call as JSON."""
-        values = {**asdict(self.channel), "end": self.end, "session": self.session}
-        return json.dumps(values, separators=(",", ":")).encode()
-
-    def ended_by(self, proof: bytes) -> bool:
-        """Whether the bytes that a message shows end the run."""
-        return len(proof) == _PROOF_BYTES and sha256(proof).hexdigest() == self.end
+        pid, end = os.getpid(), sha256(self.proof).hexdigest()
+        call = Call(node, _machine(), pid, _state(pid)[1], end, self.session)
+        return json.dumps(asdict(call), separators=(",", ":")).encode()
 
 
 def run_text(number: int) -> str:

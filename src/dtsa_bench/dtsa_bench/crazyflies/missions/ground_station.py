@@ -21,8 +21,8 @@ from std_msgs.msg import Empty as EmptyMessage
 from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.crazyflie.controls import shortest_s
 from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS, STATE, STOP_HERE, Arm, GoTo, Land, Takeoff
+from dtsa_agent.crazyflie.orders import shortest_s
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state import to_map, to_world
 from dtsa_agent.ros.common.loop import ExecutorThread
