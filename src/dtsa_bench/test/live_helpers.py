@@ -125,20 +125,20 @@ class LiveLaboratory(Laboratory):
 
 def main() -> int:
     place, out, what, *more = sys.argv[1:]
-    lab: Any
+    flight: Any
     if what.endswith(".json"):
         swarm = SwarmConfig.from_dict(json.loads(Path(what).read_text(encoding="utf-8")))
         # The protocol on board, with dongles on its air; the ground is a program there.
         make = partial(LiveLaboratory, Path(place), 3)
         flight = OnboardSwarm(swarm, LabSettings(boot_s=0.1), Path(out), key_of(swarm), enable_s=None, make=make)
-        lab, finish = flight.lab, flight.summary
+        lab: Any = flight.lab
     else:
-        lab = LiveLaboratory(Path(place), 3, read_app(what), LabSettings(agents=int(more[0])))
-        finish = lab.summary
+        flight = lab = LiveLaboratory(Path(place), 3, read_app(what), LabSettings(agents=int(more[0])))
     signal.signal(signal.SIGINT, lambda *_: lab.stop())
-    with lab:
+    with flight:
         lab.fly(600.0)
-        print(json.dumps(finish()))
+        summary = flight.summary()
+    print(json.dumps(summary))
     return 0
 
 

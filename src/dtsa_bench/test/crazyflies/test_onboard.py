@@ -90,7 +90,6 @@ def test_one_is_switched_off_and_on_again_and_the_others_fly_on(tmp_path: Path) 
         lab.run(16.0)
         assert lab.log(4, "dtsa.heard") > 50  # from the floor, it takes part
         assert [lab.log(k, "dtsa.mode") for k in (1, 2, 3, 5)] == [FLY] * 4
-        flight.summary()
     assert merged(tmp_path)["decisions_again"]["differences"] == []
 
 
@@ -106,7 +105,6 @@ def test_an_agent_with_a_new_goal_is_soon_heard(known: bool, tmp_path: Path) -> 
         lab.run(13.3)
         new = [lab.log(k, "dtsa.sent") - old for k, old in enumerate(before, 1)]
         lab.run(13.3 if known else 15.0)
-        flight.summary()
     assert all((data == b"T\0goals known") == known for _, _, data in lab.from_apps[-5:])
     assert known or min(new) >= 3  # of 30 slots each has six
     assert merged(tmp_path)["decisions_again"]["differences"] == []

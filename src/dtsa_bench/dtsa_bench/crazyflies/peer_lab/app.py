@@ -102,12 +102,8 @@ class LabSettings(Settings):
         0.0, "packets a second that the ground station sends to each vehicle; 0: no ground station on the air",
         unit="1/s", minimum=0.0, maximum=1000.0,
     )  # fmt: skip
-    noise: bool = setting(True, "estimates have noise")
     arming: str = setting(
         "auto", "how vehicles are armed: by themselves, or as required by the ground", choices=("auto", "required")
-    )
-    spin_ms: float = setting(
-        500.0, "an app's task that does not wait for so long ends the flight", unit="ms", minimum=1.0, maximum=1e6
     )
     radius_m: float = setting(
         0.0, "vehicles start on a circle of this radius around the origin; 0: on an ellipse of 1.2 m by 2 m", unit="m",

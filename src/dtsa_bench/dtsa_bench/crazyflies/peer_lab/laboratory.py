@@ -41,6 +41,7 @@ _OWN_NAMES = ["lab.priority", "lab.planner"]
 _PLANNER = {IDLE: 0, FLYING: 1, LANDING: 3, DISABLED: 4}  # firmware/crtp_commander_high_level.h
 _NEAR_RSSI, _NEAREST_M = 40, 0.1  # -dBm at 1 m
 _FOREIGN_RSSI = 60
+_SPIN_MS = 500  # an app's task that does not wait for so long ends the flight
 _TAKE_OFF, _LAND = 7, 8  # packets of the high-level commander
 
 
@@ -68,13 +69,11 @@ class Laboratory:
         self._copies = 0
         self._engine = Engine(
             engine_library(), count, [*_NAMES, *_OWN_NAMES], _KNOWN, line.to_fixed_ns, line.to_byte_ns,
-            round(settings.spin_ms * 1e6),
+            _SPIN_MS * 1_000_000,
         )  # fmt: skip
         self.record = Record(count, app.addressed, out)
         self._observers: tuple[Observer, ...] = (self.record, *observers)
-        config = FleetConfig(
-            count=count, start=settings.start, seed=settings.seed, noise=settings.noise, arming=settings.arming
-        )
+        config = FleetConfig(count=count, start=settings.start, seed=settings.seed, arming=settings.arming)
         header = {"count": count, "seed": settings.seed, "start": np.asarray(config.start).tolist()}
         self._truth = TruthLog(out / "truth.jsonl" if out else None, header)
         self.motion = FleetMotion(config, self._report)
@@ -175,7 +174,7 @@ class Laboratory:
         elif kind is not EngineEvent.ENDED:
             text = data.decode("utf-8", "replace")
             reason = {
-                EngineEvent.SPINS: f"task {text} has not waited for {self.settings.spin_ms:g} ms: it never yields",
+                EngineEvent.SPINS: f"task {text} has not waited for {_SPIN_MS} ms: it never yields",
                 EngineEvent.ASSERT: f"assertion failed in {text}",
             }.get(kind, f"it used {text}")
             raise AppError(f"app of agent {k + 1} at {now / 1e9:.6f} s: {reason}")

@@ -156,12 +156,12 @@ class OnboardSwarm:
         return self
 
     def __exit__(self, *unused: object) -> None:
+        for flight in self._flights:
+            flight.finish()
         self.lab.close()
 
     def summary(self) -> dict[str, Any]:
-        """The flight is over: bags are closed; what came of it."""
+        """What came of it."""
         goal = np.array(self.scenario.target) + _UP
         away = np.sqrt(((goal - self.lab.motion.vehicles.position) ** 2).sum(axis=0))
-        for flight in self._flights:
-            flight.finish()
         return {**self.lab.summary(), "away_m": [round(float(x), 3) for x in away]}

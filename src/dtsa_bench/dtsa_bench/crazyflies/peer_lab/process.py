@@ -75,7 +75,7 @@ def _fly(
 
         flight = OnboardSwarm(swarm, settings, out, key_of(swarm), app=app)
         lab = flight.lab
-    with lab:
+    with flight:
         agents = range(1, lab.settings.agents + 1)
         for name, value in parameters.items():
             for agent in agents:

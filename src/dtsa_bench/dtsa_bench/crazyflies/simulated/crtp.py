@@ -47,6 +47,10 @@ PARAM_TYPES = {
 }  # fmt: skip
 READ_ONLY = 0x40
 LOG_FORMAT_BY_CODE = dict(LOG_TYPES.values())
+_LIMITS = {
+    "B": (0, 2**8 - 1), "H": (0, 2**16 - 1), "I": (0, 2**32 - 1), "b": (-(2**7), 2**7 - 1), "h": (-(2**15), 2**15 - 1),
+    "i": (-(2**31), 2**31 - 1),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +140,9 @@ LOG_TABLE = VariableTable(LOG_ENTRIES, log=True)
 PARAM_TABLE = VariableTable(PARAM_ENTRIES, log=False)
 
 
-def pack_value(value: float, form: str) -> bytes:
+def limit_value(value: float, form: str) -> float:
     """A value as a variable of this struct format holds it: rounded and kept within its range."""
-    if form not in "fe":
-        bits = 8 * struct.calcsize("<" + form)
-        low, high = (0, 2**bits - 1) if form.isupper() else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-        value = min(max(round(value), low), high)
-    return struct.pack("<" + form, value)
+    if form not in _LIMITS:
+        return value
+    low, high = _LIMITS[form]
+    return min(max(round(value), low), high)

@@ -82,25 +82,24 @@ def compress(q: tuple[float, float, float, float]) -> int:
 
 def log_values(estimate: Estimate, firmware: Firmware, t: float) -> dict[str, float]:
     """All log variables at time t, by their full names, in the firmware's units."""
-    roll, pitch = attitude(estimate.acceleration, firmware.yaw)
-    supervisor, battery, setpoint = firmware.supervisor, firmware.battery, firmware.setpoint
+    (x, y, z), (vx, vy, vz), yaw = estimate.position, estimate.velocity, firmware.yaw
+    roll, pitch = attitude(estimate.acceleration, yaw)
+    supervisor, battery, degrees = firmware.supervisor, firmware.battery, math.degrees
+    rate = firmware.setpoint.yaw_rate if firmware.setpoint is not None else 0.0
+    variance = estimate.variance(t)
     info = supervisor.info(
         planner_active=firmware.planner.state != IDLE, trajectory_finished=firmware.planner.finished(t)
     )
-    values = (  # in the order of LOG_ENTRIES
-        *(1000 * v for v in (*estimate.position, *estimate.velocity)),
-        compress(quaternion(roll, pitch, firmware.yaw)),
-        *(0.0, 0.0, 1000 * setpoint.yaw_rate if setpoint is not None else 0.0),
-        *estimate.position,
-        *estimate.velocity,
-        # The firmware's log shows pitch with the opposite sign.
-        *map(math.degrees, (roll, -pitch, firmware.yaw)),
-        *(battery.voltage * 1000, battery.voltage),
-        3 if battery.voltage < LOW_V else 0,
+    values = (  # in the order of LOG_ENTRIES; the firmware's log shows pitch with the opposite sign
+        x * 1000, y * 1000, z * 1000, vx * 1000, vy * 1000, vz * 1000,
+        compress(quaternion(roll, pitch, yaw)),
+        0.0, 0.0, rate * 1000,
+        x, y, z, vx, vy, vz, degrees(roll), -degrees(pitch), degrees(yaw),
+        battery.voltage * 1000, battery.voltage, 3 if battery.voltage < LOW_V else 0,
         min(100, max(0, battery.charge * 100)),
         info,
-        *(supervisor.motors_allowed, supervisor.flying, supervisor.tumbled),
-        *(estimate.variance(t),) * 3,
+        supervisor.motors_allowed, supervisor.flying, supervisor.tumbled,
+        variance, variance, variance,
         RSSI,
-    )
+    )  # fmt: skip
     return dict(zip(_NAMES, values, strict=True))

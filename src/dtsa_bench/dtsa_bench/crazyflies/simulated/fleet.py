@@ -195,7 +195,8 @@ class Fleet:
 
     def _send_logs(self) -> None:
         for index, peer in enumerate(self.peers):
-            packets = list(peer.log_packets(self.tick, self.time)) if peer.blocks else ()
+            has_host = self.radio is not None or self._links[index].host is not None
+            packets = list(peer.log_packets(self.tick, self.time)) if peer.blocks and has_host else ()
             if packets and self.radio and not self.radio.receivers[index].connected(self.radio.now_ns() / 1e9):
                 peer.blocks.clear()  # no host is there: the log ends
                 continue

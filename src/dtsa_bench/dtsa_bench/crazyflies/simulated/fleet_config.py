@@ -84,7 +84,6 @@ class FleetConfig(Settings):
     count: int = setting(12, "number of vehicles", minimum=0, maximum=MAX_COUNT)
     base_port: int = setting(19850, "UDP port of the first; vehicle k listens on base_port + k - 1", minimum=1024,
                              maximum=65535)  # fmt: skip
-    control_port: int = setting(0, "UDP port for faults; 0: base_port - 1", minimum=0, maximum=65535)
     start: Any = field(default=None, compare=False)
     seed: int = setting(1, "seed of noise and loss", minimum=0, maximum=2**63 - 1)
     protocol: int = setting(12, "version of the protocol told to the host", choices=PROTOCOLS)
@@ -94,7 +93,6 @@ class FleetConfig(Settings):
         "Bolt), or every second one so",
         choices=("auto", "required", "mixed"),
     )
-    noise: bool = setting(True, "sensors have noise")
     model: str = setting("orca", "flight model that has their vehicle", choices=AVOIDERS.names, open_choices=True)
     truth: Path | None = None
     radio: RadioSettings = field(default_factory=RadioSettings)
@@ -110,10 +108,13 @@ class FleetConfig(Settings):
             object.__setattr__(self, "start", ellipse_positions(self.count))
         elif np.shape(self.start) != (3, self.count):
             raise ConfigError("start", np.shape(self.start), f"an array of shape (3, {self.count})")
-        if not self.control_port:
-            object.__setattr__(self, "control_port", self.base_port - 1)
         if self.radio.path is not None and len(self.radio.stations) != self.count:
             raise ConfigError("radio", len(self.radio.stations), f"a station for each of {self.count} vehicles")
+
+    @property
+    def control_port(self) -> int:
+        """UDP port for faults."""
+        return self.base_port - 1
 
     @property
     def uris(self) -> list[str]:

@@ -59,7 +59,6 @@ class FleetMotion:
     """Vehicles that fly by their firmware; `report` gets an index, the name of an event and details."""
 
     def __init__(self, config: FleetConfig, report: Callable[..., None]) -> None:
-        self._config = config
         self._report = report
         vehicle = flight_model(config.model).vehicle
         self.vehicles = Vehicles(config.start, vehicle)
@@ -90,10 +89,9 @@ class FleetMotion:
 
     def _estimate(self) -> None:
         state = np.concatenate([self.vehicles.position, self.vehicles.velocity])
-        if self._config.noise:
-            noise = self._noise.standard_normal(state.shape)
-            state[:3] += POSITION_NOISE_M * noise[:3]
-            state[3:] += VELOCITY_NOISE_MPS * noise[3:]
+        noise = self._noise.standard_normal(state.shape)
+        state[:3] += POSITION_NOISE_M * noise[:3]
+        state[3:] += VELOCITY_NOISE_MPS * noise[3:]
         rows = zip(self.estimates, state.T.tolist(), self.vehicles.acceleration.T.tolist(), strict=True)
         for estimate, (x, y, z, vx, vy, vz), (ax, ay, az) in rows:
             estimate.update((x, y, z), (vx, vy, vz), (ax, ay, az))

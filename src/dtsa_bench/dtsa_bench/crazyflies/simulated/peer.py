@@ -26,8 +26,8 @@ class LogBlock:
     phase: int = 0
 
     @property
-    def size(self) -> int:
-        return struct.calcsize("<" + "".join(form for _, form in self.variables))
+    def form(self) -> str:
+        return "<" + "".join(form for _, form in self.variables)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,11 @@ class OnboardApp:
     get_parameter: Callable[[str], float]
     set_parameter: Callable[[str, float], None]
     log_values: Callable[[], Mapping[str, float]]
+
+
+def _pack_parameter(entry: crtp.VariableEntry, value: float) -> bytes:
+    form = crtp.PARAM_TYPES[entry.type][1]
+    return struct.pack("<" + form, crtp.limit_value(value, form))
 
 
 class CrtpPeer:
@@ -122,8 +127,8 @@ class CrtpPeer:
                 values.update(self._app.log_values())
             stamp = (int(t * 1000) & 0xFFFFFF).to_bytes(3, "little")
             for number, block in due:
-                data = b"".join(crtp.pack_value(values[name], form) for name, form in block.variables)
-                yield crtp.pack(crtp.LOG, 2, bytes((number,)) + stamp + data)
+                data = [crtp.limit_value(values[name], form) for name, form in block.variables]
+                yield crtp.pack(crtp.LOG, 2, bytes((number,)) + stamp + struct.pack(block.form, *data))
 
     # -- handlers: request's data and time in, reply's data out -----------------------------------------------------
     def _app_channel(self, data: bytes, t: float) -> None:
@@ -211,7 +216,7 @@ class CrtpPeer:
             if form is None or index >= len(self._logs):
                 return errno.ENOENT
             variables.append((self._logs[index].full_name, form))
-        if LogBlock(variables).size > MAX_BLOCK_BYTES:
+        if struct.calcsize(LogBlock(variables).form) > MAX_BLOCK_BYTES:
             return errno.E2BIG
         block.variables = variables
         self.blocks[number] = block
@@ -227,7 +232,7 @@ class CrtpPeer:
         entry = self._params[index]
         if self._app is not None and index >= len(crtp.PARAM_ENTRIES):
             self.values[index] = self._app.get_parameter(entry.full_name)
-        return crtp.pack_value(self.values[index], crtp.PARAM_TYPES[entry.type][1])
+        return _pack_parameter(entry, self.values[index])
 
     def _param_write(self, data: bytes, t: float) -> bytes:
         (index,) = struct.unpack_from("<H", data)
@@ -243,8 +248,7 @@ class CrtpPeer:
         (index,) = struct.unpack_from("<H", data, 1)
         if index >= len(self.values):
             return data[:3] + bytes((errno.ENOENT,))
-        entry = self._params[index]
-        default = crtp.pack_value(entry.value, crtp.PARAM_TYPES[entry.type][1])
+        default = _pack_parameter(self._params[index], self._params[index].value)
         return data[:3] + (b"\0" if data[0] == 8 else b"") + default
 
     def set_parameter(self, index: int, value: float, t: float) -> None:
