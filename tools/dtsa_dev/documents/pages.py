@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import dtsa
-from dtsa_agent.core.plugins import kinds
 from dtsa_bench.commands import cli, registry
 from dtsa_bench.experiments.sweep import setting_specs
 from dtsa_dev import registry as developers
@@ -103,9 +101,7 @@ def _library() -> Iterator[str]:
         for name in names:
             yield _entry(f"{getattr(dtsa, name).__module__}.{getattr(dtsa, name).__qualname__}", names is not _SETTINGS)
         if "Table" in names:
-            yield "What a plug-in is, by kind ([plug-ins](plug-ins.md) says which methods do what):\n\n"
-            for kind in _kinds():
-                yield _entry(f"{kinds.__name__}.{kind}", True)
+            yield "The methods of each kind, with shapes, units and errors: [plug-ins](plug-ins.md).\n\n"
     yield "## An environment for learning\n\n"
     yield "Each name is `dtsa.env.NAME`. What agents observe: [how-to](../how-to/learning.md).\n\n"
     for name in dtsa.env.__all__:
@@ -133,11 +129,6 @@ def run_settings() -> str:
         "class RunSettings(TypedDict, total=False):\n"
         '    """Units and ranges: docs/reference/settings.md and docs/reference/channel.md."""\n\n' + "".join(lines)
     )
-
-
-def _kinds() -> list[str]:
-    text = Path(kinds.__file__).read_text(encoding="utf-8")
-    return re.findall(r"^class (\w+)\(Protocol\)", text, re.MULTILINE)
 
 
 def _entry(identifier: str, members: bool) -> str:

@@ -36,7 +36,9 @@ def policy_key(seed: int) -> int:
 def plug_in_random(config: SwarmConfig, agent: int, name: str) -> np.random.Generator:
     """Random numbers of one instance of a plug-in: the same in nodes, simulator and verifier.
 
-    :param config, agent: what its factory was given; the run's seed counts.
+    :param config: what its factory was given; the run's seed counts.
+    :param agent: what its factory was given.
+    :param name: of the plug-in.
     """
     return generator(config.seed, STREAM_PLUG_INS, agent, *name.encode())
 
