@@ -16,8 +16,14 @@ from hypothesis import strategies as st
 from waiting import wait_for
 
 from dtsa_agent.air import crazyradio_port, device_port
-from dtsa_agent.air.crazyradio_packets import BROADCAST, PacketReader, broadcast, datagram_in
-from dtsa_agent.air.crazyradio_port import CrazyradioPort, DongleClock
+from dtsa_agent.air.crazyradio_port import (
+    BROADCAST,
+    CrazyradioPort,
+    DongleClock,
+    PacketReader,
+    broadcast,
+    datagram_in,
+)
 from dtsa_agent.air.port import check_fits, flight_ns, link_of, settings_class
 from dtsa_agent.air.settings import CrazyradioSettings
 from dtsa_agent.core import ConfigError, SwarmConfig

@@ -17,7 +17,7 @@ from waiting import wait_for
 
 pytest.importorskip("usb")
 
-from dtsa_agent.air.crazyradio_packets import broadcast, datagram_in
+from dtsa_agent.air.crazyradio_port import broadcast, datagram_in
 from dtsa_agent.air.port import link_of
 from dtsa_agent.air.settings import CrazyradioSettings
 from dtsa_agent.core import SwarmConfig
