@@ -32,8 +32,6 @@ _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the la
 
 @dataclass(slots=True)
 class _Caller:
-    """A channel that has called."""
-
     call: Call
     publisher: PublisherGuard
     introductions: int = 0  # on calls of a run under way
@@ -71,7 +69,7 @@ class Membership:
     def admits(self, message: Fields, sender: bytes | None) -> bool:
         """Whether a slot message is one of this run; others are counted. A channel that calls is answered.
 
-        :raises ConfigError: when the channel refuses this process.
+        ConfigError: the channel refuses this process.
         """
         try:
             self._check(message, sender)

@@ -39,7 +39,7 @@ _SERVING_S, _END_S = 0.5, 2.0
 
 
 class _NoExecutor(CallbackGroup):
-    """Keeps ordinary executors away from a subscription."""
+    """Keeps executors away from a subscription."""
 
     def can_execute(self, entity: Any) -> bool:
         return False
