@@ -29,7 +29,8 @@ from dtsa_agent.ros.common.parameters import (
 )
 from dtsa_agent.stop import Stop
 
-from .swarm_node import AgentsNode, SwarmNode
+from .agents_node import AgentsNode
+from .swarm_node import SwarmNode
 
 _SHARED = Setting(
     "shared_table", "bool", False,
@@ -100,8 +101,7 @@ def host_agents(
         logger.error(f"ends after slot {agents.slot}: {error}")
         raise
     finally:
-        agents.membership.close()
-        agents.loop.close()
+        agents.close()
 
 
 def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, host: HostSettings) -> AgentsNode:
