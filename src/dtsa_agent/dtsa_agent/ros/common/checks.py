@@ -117,9 +117,10 @@ def check_slot(message: Any, agents: int) -> None:
         raise BadMessage(SIZES, f"slot message of phase {phase} with frames")
     if len(lengths) != count or received != count * ((agents + 7) // 8):
         raise BadMessage(SIZES, f"slot message: {count} senders, {len(lengths)} lengths, {received} bytes of receivers")
-    if phase == Slot.RUN:
-        check_frames(lengths, message.data)
+    if phase == Slot.RUN and not count and len(message.data):
+        raise BadMessage(SIZES, "slot message with frames of no agent")
     if count:
+        check_frames(lengths, message.data)
         if not all(lengths):
             raise BadMessage(SIZES, "slot message with an empty frame")
         check_ids(message.sender, agents, ascending=False)
