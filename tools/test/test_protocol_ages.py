@@ -76,7 +76,7 @@ def test_lease_is_younger_than_tdma(agents, movers, warmup, more, ceiling):
     for out in flown:
         assert out.ledger is not None
         assert out.ledger.broken == []
-        assert out.collisions == out.ledger.open_collisions + out.ledger.adopted_collisions
+        assert out.collisions == out.ledger.collisions["open"] + out.ledger.collisions["adopted"]
     assert sum(out.collisions for out in flown) <= 0.002 * sum(out.slots for out in flown)
 
 

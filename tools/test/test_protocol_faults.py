@@ -12,7 +12,7 @@ from dtsa_dev.protocol.experiment import Experiment, FlightEvent, random_schedul
 
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.frame import ExtendedFrame, encode_extended
-from dtsa_bench.log.rules import GrantLedger, RuleChecker
+from dtsa_bench.log.rules import PLAIN, GrantLedger, RuleChecker
 from dtsa_bench.log.verify.result import Mismatch, Result
 from dtsa_channel_sim import ChannelConfig
 
@@ -74,7 +74,7 @@ def test_by_default_two_senders_only_in_turns_that_are_counted(chunk: int) -> No
         assert out.ledger is not None
         assert out.ledger.broken == [], seed
         book = out.ledger
-        known = book.open_collisions + book.adopted_collisions + book.anchor_collisions + book.handed_collisions
+        known = book.collisions.total() - book.collisions[PLAIN]
         assert out.collisions == known
 
 
@@ -132,11 +132,11 @@ def test_the_ledger_sees_broken_rules() -> None:
     assert judged({**given, 8: {3: frame(3, 8)}}).broken == []
     assert "owner 1 sends in a turn that it gave" in judged({**given, 8: {1: frame(1, 8)}}).broken[0]
     both = judged({**given, 8: {1: frame(1, 8), 3: frame(3, 8)}})
-    assert both.plain_collisions == 1
+    assert both.collisions[PLAIN] == 1
     again = {4: {1: frame(1, 4, b"\0\2" + bytes(9))}, 8: {1: frame(1, 8, b"\3" + bytes(10))}}
     assert "a second time" in judged(again).broken[0]
     opened = judged({4: {1: frame(1, 4, b"\xff" + bytes(10))}, 8: {2: frame(2, 8), 3: frame(3, 8)}})
-    assert (opened.broken, opened.open_collisions) == ([], 1)
+    assert (opened.broken, opened.collisions["open"]) == ([], 1)
     book = GrantLedger(3, 3)
     own = Frame(1, 3, 1, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
     book.note_frame(3, 1, encode_extended(ExtendedFrame(own, c_s=1, probation=True)))

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -57,11 +57,11 @@ class FakeFleet:
 @contextlib.contextmanager
 def fake_fleet(
     folder: Path, count: int, *options: str, environment: dict[str, str] | None = None,
-    module: str = "dtsa_bench.crazyflies.simulated.cli",
+    program: Sequence[str] = ("dtsa_bench", "fake-crazyflie"),
 ) -> Iterator[FakeFleet]:  # fmt: skip
     base = free_base_port(count)
     truth = folder / f"truth-{base}.jsonl"
-    command = [sys.executable, "-m", module, "--count", str(count), "--base-port", str(base)]
+    command = [sys.executable, "-m", *program, "--count", str(count), "--base-port", str(base)]
     command += ["--truth", str(truth), "--quiet", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
@@ -120,7 +120,7 @@ class Flight:
         while not self.stop.wait(0.02):
             for name, velocity in self.velocity.items():
                 if velocity is not None:
-                    self.bridge.vehicles[name].controls.command(velocity_world(velocity, 0.0, time.monotonic()))
+                    self.bridge.vehicles[name].command(velocity_world(velocity, 0.0, time.monotonic()))
 
     def take_off(self) -> None:
         """Arm, climb to the middle of the room, and begin to stream zero velocity."""

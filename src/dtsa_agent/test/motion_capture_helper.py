@@ -16,6 +16,7 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 
 from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
+from dtsa_bench.commands.cli import main
 from dtsa_bench.crazyflies.simulated import cli, motion, process
 from dtsa_bench.crazyflies.simulated.estimate import Estimate
 from dtsa_bench.crazyflies.simulated.fleet import Fleet
@@ -125,14 +126,14 @@ class TrackedFleet(Fleet):
             self._unseen.add(index)
 
 
-def main() -> int:
+def fly() -> int:
     motion.Estimate = HostEstimate  # type: ignore[misc]
     cli.Fleet = TrackedFleet  # type: ignore[misc]
     process.FAULTS["unseen"] = "motion capture does not see it"
-    code = cli.main(sys.argv[1:])
+    code = main(["fake-crazyflie", *sys.argv[1:]])
     rclpy.try_shutdown()
     return code
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(fly())

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         SwarmConfig,
         plug_in_random,
     )
-    from dtsa_agent.core.plugins.kinds import Table
+    from dtsa_agent.core.plugins.entry_points import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
     from dtsa_bench.drawing.palette import agent_colour
     from dtsa_bench.log.bag.errors import BagError, UnusableBag
@@ -41,45 +41,11 @@ if TYPE_CHECKING:
     from ._sweep import SweepResult, sweep
 
 __all__ = [
-    "REASONS",
-    "Agent",
-    "BagError",
-    "Channel",
-    "ChannelConfig",
-    "ClockConfig",
-    "ConfigError",
-    "Decision",
-    "Difference",
-    "DtsaError",
-    "FlightLog",
-    "LocalProtocolError",
-    "PluginError",
-    "RemoteProtocolError",
-    "RunConfig",
-    "RunLimits",
-    "SlotOutcome",
-    "SwarmConfig",
-    "SweepResult",
-    "Table",
-    "UnusableBag",
-    "Verdict",
-    "Verification",
-    "__version__",
-    "agent_colour",
-    "env",
-    "open",
-    "plot_ages",
-    "plot_bars",
-    "plot_distances",
-    "plot_lines",
-    "plot_matrix",
-    "plot_trajectories",
-    "plug_in_random",
-    "register",
-    "run_config",
-    "simulate",
-    "sweep",
-    "verify",
+    "REASONS", "Agent", "BagError", "Channel", "ChannelConfig", "ClockConfig", "ConfigError", "Decision", "Difference",
+    "DtsaError", "FlightLog", "LocalProtocolError", "PluginError", "RemoteProtocolError", "RunConfig", "RunLimits",
+    "SlotOutcome", "SwarmConfig", "SweepResult", "Table", "UnusableBag", "Verdict", "Verification", "__version__",
+    "agent_colour", "env", "open", "plot_ages", "plot_bars", "plot_distances", "plot_lines", "plot_matrix",
+    "plot_trajectories", "plug_in_random", "register", "run_config", "simulate", "sweep", "verify",
 ]  # fmt: skip
 
 _HOMES = {

@@ -1,6 +1,6 @@
 """Environments for learning: agents that say when they send, and any agents with a channel between them.
 
-See docs/how-to/learning.md and docs/how-to/environments.md.
+See docs/how-to/learning.md and docs/how-to/relay.md.
 """
 
 from __future__ import annotations

@@ -32,11 +32,8 @@ def recorded_channel() -> int:
 
 def fake_crazyflie() -> int:
     """``ros2 run dtsa_bench fake_crazyflie``."""
-    try:
-        from dtsa_bench.crazyflies.simulated.cli import main
-    except ImportError as error:
-        return report_missing_package("fake_crazyflie", error)
-    return main()
+    sys.argv.insert(1, "fake-crazyflie")
+    return dtsa()
 
 
 if __name__ == "__main__":

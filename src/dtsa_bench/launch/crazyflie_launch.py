@@ -49,36 +49,23 @@ def _processes(context: LaunchContext) -> list:
         actions.append(ExecuteProcess(cmd=fly, output="screen", name="mission", sigterm_timeout=LAND_S, on_exit=over))
         return actions
     bridge = Node(
-        package="dtsa_agent",
-        executable="crazyflie_bridge",
-        name="crazyflie_server",
-        parameters=[{"config": os.path.abspath(config)}],
-        output="screen",
-        sigterm_timeout=LAND_S,
-        on_exit=over,
-    )
+        package="dtsa_agent", executable="crazyflie_bridge", name="crazyflie_server", output="screen",
+        parameters=[{"config": os.path.abspath(config)}], sigterm_timeout=LAND_S, on_exit=over,
+    )  # fmt: skip
     return [*actions, bridge]
 
 
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` asks for."""
     yes_no = ["true", "false"]
-    choices = {"mission": yes_no, "simulated": yes_no}
-    described = {
-        "config": "the swarm's YAML file",
-        "mission": "fly a recorded mission",
-        "simulated": "the Crazyflies are simulated ones",
-        "out": "directory for a mission's bag and results",
-        "options": "further options of a mission, as `fly` has them",
-    }
-    defaults = {"mission": "false", "simulated": "false", "out": "mission"}
     arguments = [
-        DeclareLaunchArgument(
-            name,
-            default_value=defaults.get(name, ""),
-            choices=choices.get(name),
-            description=text,
+        DeclareLaunchArgument(name, default_value=default, choices=choices, description=text)
+        for name, default, choices, text in (
+            ("config", "", None, "the swarm's YAML file"),
+            ("mission", "false", yes_no, "fly a recorded mission"),
+            ("simulated", "false", yes_no, "the Crazyflies are simulated ones"),
+            ("out", "mission", None, "directory for a mission's bag and results"),
+            ("options", "", None, "further options of a mission, as `fly` has them"),
         )
-        for name, text in described.items()
     ]
     return LaunchDescription([*arguments, OpaqueFunction(function=_processes)])

@@ -22,25 +22,19 @@ def _nodes(context: LaunchContext) -> list[Node]:
     space = "/" + LaunchConfiguration("swarm_namespace").perform(context).strip("/")
     spaces = [names.agent_namespace(k + 1, space) for k in range(int(LaunchConfiguration("agents").perform(context)))]
     clock = [("/clock", names.clock_topic(space))]
+    described = {agent: model.replace("${PREFIX}", f"{agent.strip('/')}/") for agent in spaces}
     nodes = [
         Node(
-            package="robot_state_publisher",
-            executable="robot_state_publisher",
-            namespace=agent,
-            parameters=[
-                {"robot_description": model.replace("${PREFIX}", f"{agent.strip('/')}/"), "use_sim_time": True}
-            ],
-            remappings=clock,
+            package="robot_state_publisher", executable="robot_state_publisher", namespace=agent, remappings=clock,
+            parameters=[{"robot_description": text, "use_sim_time": True}],
         )
-        for agent in spaces
-    ]
+        for agent, text in described.items()
+    ]  # fmt: skip
     rviz = Node(
-        package="rviz2",
-        executable="rviz2",
-        arguments=["-d", str(share / "rviz/swarm.rviz")],
+        package="rviz2", executable="rviz2", arguments=["-d", str(share / "rviz/swarm.rviz")],
         parameters=[{"use_sim_time": True}],
         remappings=[*clock, (f"{names.SWARM}/{names.MARKERS}", f"{space}/{names.MARKERS}")],
-    )
+    )  # fmt: skip
     return [*nodes, rviz]
 
 

@@ -26,119 +26,82 @@ from dtsa_channel_sim import ChannelConfig, ClockConfig
 
 UNSET = ""  # the node's own default
 CLOCKS = "clocks."  # stands before the names of the clocks' settings
+SECTIONS = ((SwarmConfig, ""), (ChannelConfig, ""), (RunLimits, ""), (ClockConfig, CLOCKS))
+MORE = {  # default, choices, description
+    "processes": ("per-agent", None, "per-agent, or a number of processes"),
+    "mode": (MODES[0], MODES, "lockstep: all wait for each other; realtime: each agent has a clock of its own"),
+    "align": ("true", ["true", "false"], "real time: agents align their clocks"),
+    "swarm_namespace": (
+        names.SWARM, None, "namespace of the swarm's topics; agents are in it unless it is the default",
+    ),
+    "priority": (
+        str(FlightOptions().priority), None,
+        "real time: real-time priority of the agents, one more for the channel, where allowed; 0: none",
+    ),
+    "out": ("flight", None, "new directory for the bag and the results"),
+    "channel_file": ("", None, "YAML file with settings of the channel"),
+}  # fmt: skip
 
 
 def _settings(cls: type) -> list:
-    return [
-        s
-        for s in settings_of(cls)
-        if s.kind != "structure" and s.name not in (FROM_SWARM if cls is ChannelConfig else ())
-    ]
+    left_out = FROM_SWARM if cls is ChannelConfig else ()
+    return [s for s in settings_of(cls) if s.kind != "structure" and s.name not in left_out]
 
 
-def _given_arguments(context: LaunchContext, cls: type, prefix: str = "") -> dict:
+def _given(context: LaunchContext, cls: type, prefix: str = "") -> dict:
     """Settings from the launch arguments that were given."""
-    values = {}
-    for setting in _settings(cls):
-        text = LaunchConfiguration(prefix + setting.name).perform(context)
-        if text != UNSET:
-            values[setting.name] = text if setting.kind == "values" else setting.parse(text)
-    return values
+    given = ((s, LaunchConfiguration(prefix + s.name).perform(context)) for s in _settings(cls))
+    return {s.name: text if s.kind == "values" else s.parse(text) for s, text in given if text != UNSET}
 
 
-def _run_config(context: LaunchContext, swarm: SwarmConfig, channel: dict) -> RunConfig:
+def _run_config(swarm: SwarmConfig, channel: dict, clocks: dict, more: dict) -> RunConfig:
     """The run as far as the agents' parameters depend on it.
 
     :raises ConfigError: for settings that are not usable.
     """
-    file = LaunchConfiguration("channel_file").perform(context)
-    values = {**channel, **from_swarm(swarm)}
+    file, values = more["channel_file"], {**channel, **from_swarm(swarm)}
     air = ChannelConfig.from_yaml(file, **values) if file else ChannelConfig.from_dict(values)
-    mode = LaunchConfiguration("mode").perform(context)
-    align = LaunchConfiguration("align").perform(context) == "true"
-    return RunConfig(
-        swarm, air, mode=mode, clocks=ClockConfig(**_given_arguments(context, ClockConfig, CLOCKS)), align=align
-    )
+    return RunConfig(swarm, air, mode=more["mode"], clocks=ClockConfig(**clocks), align=more["align"] == "true")
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
-    swarm, channel = _given_arguments(context, SwarmConfig), _given_arguments(context, ChannelConfig)
+    swarm, channel, limits, clocks = (_given(context, cls, prefix) for cls, prefix in SECTIONS)
+    more = {name: LaunchConfiguration(name).perform(context) for name in MORE}
     config = SwarmConfig.from_dict({key: value for key, value in swarm.items() if key != "options"})
-    run = _run_config(context, config, channel)
-    space = "/" + LaunchConfiguration("swarm_namespace").perform(context).strip("/")
-    processes = LaunchConfiguration("processes").perform(context)
-    priority = whole_number(LaunchConfiguration("priority").perform(context), "priority", 0, 90)
+    run = _run_config(config, channel, clocks, more)
+    space = "/" + more["swarm_namespace"].strip("/")
+    priority = whole_number(more["priority"], "priority", 0, 90)
     recorded = {
-        **swarm,
-        **channel,
-        **_given_arguments(context, RunLimits),
-        **{CLOCKS + name: value for name, value in _given_arguments(context, ClockConfig, CLOCKS).items()},
-        "mode": run.mode,
-        "align": run.align,
-        "priority": priority and priority + 1,
-        "out": LaunchConfiguration("out").perform(context),
-        "channel_file": LaunchConfiguration("channel_file").perform(context),
-    }
+        **swarm, **channel, **limits, **{CLOCKS + name: value for name, value in clocks.items()},
+        "mode": run.mode, "align": run.align, "priority": priority and priority + 1, "out": more["out"],
+        "channel_file": more["channel_file"],
+    }  # fmt: skip
     if "partition" in recorded:  # JSON: launch would make a list of lists of it, which no parameter can be
         recorded["partition"] = ParameterValue(recorded["partition"], value_type=str)
-    nodes = [
+    over = Shutdown(reason="the flight is over")
+    channel_node = Node(
+        package="dtsa_bench", executable="recorded_channel", namespace=space, name="channel", parameters=[recorded],
+        output="screen", on_exit=over,
+    )  # fmt: skip
+    processes = agent_processes(run, process_count(more["processes"], config.agents), priority, space)
+    return [channel_node, *(
         Node(
-            package="dtsa_bench",
-            executable="recorded_channel",
-            namespace=space,
-            name="channel",
-            parameters=[recorded],
-            output="screen",
-            on_exit=Shutdown(reason="the flight is over"),
+            package="dtsa_agent", executable=process.executable, namespace=process.namespace, name=process.node,
+            parameters=[{**swarm, "mode": run.mode, "swarm_namespace": space, **process.parameters}], output="screen",
         )
-    ]
-    nodes += [
-        Node(
-            package="dtsa_agent",
-            executable=process.executable,
-            namespace=process.namespace,
-            name=process.node,
-            parameters=[{**swarm, "mode": run.mode, "swarm_namespace": space, **process.parameters}],
-            output="screen",
-        )
-        for process in agent_processes(run, process_count(processes, config.agents), priority, space)
-    ]
-    return nodes
+        for process in processes
+    )]  # fmt: skip
 
 
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` asks for."""
-    arguments = [
-        DeclareLaunchArgument(
-            prefix + setting.name, default_value=UNSET, description=f"{setting.description} [{setting.default}]"
-        )
-        for cls, prefix in ((SwarmConfig, ""), (ChannelConfig, ""), (RunLimits, ""), (ClockConfig, CLOCKS))
-        for setting in _settings(cls)
+    described = [
+        DeclareLaunchArgument(prefix + s.name, default_value=UNSET, description=f"{s.description} [{s.default}]")
+        for cls, prefix in SECTIONS
+        for s in _settings(cls)
     ]
-    arguments += [
-        DeclareLaunchArgument(
-            "processes", default_value="per-agent", description="per-agent, or a number of processes"
-        ),
-        DeclareLaunchArgument(
-            "mode",
-            default_value=MODES[0],
-            choices=MODES,
-            description="lockstep: all wait for each other; realtime: each agent has a clock of its own",
-        ),
-        DeclareLaunchArgument(
-            "align", default_value="true", choices=["true", "false"], description="real time: agents align their clocks"
-        ),
-        DeclareLaunchArgument(
-            "swarm_namespace",
-            default_value=names.SWARM,
-            description="namespace of the swarm's topics; agents are in it unless it is the default",
-        ),
-        DeclareLaunchArgument(
-            "priority",
-            default_value=str(FlightOptions().priority),
-            description="real time: real-time priority of the agents, one more for the channel, where allowed; 0: none",
-        ),
-        DeclareLaunchArgument("out", default_value="flight", description="new directory for the bag and the results"),
-        DeclareLaunchArgument("channel_file", default_value="", description="YAML file with settings of the channel"),
+    described += [
+        DeclareLaunchArgument(name, default_value=default, choices=choices, description=text)
+        for name, (default, choices, text) in MORE.items()
     ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
+    return LaunchDescription([*described, OpaqueFunction(function=_nodes)])

@@ -89,7 +89,7 @@ class SyntheticRun:
             self._channels[topic] = self.writer.add_topic(topic, kind, qos, definition(kind))
             self.written[topic] = []
         self._odometry = OdometryPacker([f"cf{i}/base_link" for i in self._ids])
-        self._markers = MarkerPacker([str(i) for i in self._ids])
+        self._markers = MarkerPacker(self._ids.tolist())
 
     def _write(self, topic: str, log_ns: int, publish_ns: int, packed: bytes = b"", **fields: Any) -> None:
         if topic not in self._channels:

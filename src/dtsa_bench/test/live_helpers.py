@@ -32,9 +32,8 @@ from dtsa_bench.crazyflies.peer_lab.onboard import OnboardSwarm
 from dtsa_bench.crazyflies.peer_lab.record import Observer, PeerPacket
 from dtsa_bench.crazyflies.simulated import crtp
 from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
-from dtsa_bench.crazyflies.simulated.radio.air import BROADCAST, PEER_PORT
+from dtsa_bench.crazyflies.simulated.radio.air import BROADCAST, PEER_PORT, Tuning
 from dtsa_bench.crazyflies.simulated.radio.side import RadioServer
-from dtsa_bench.crazyflies.simulated.radio.sniffer_mode import Tuned
 from dtsa_channel_sim.model.medium import OnAir
 
 WAIT_S = 0.001
@@ -56,38 +55,30 @@ class LiveLaboratory(Laboratory):
     ) -> None:
         stations = tuple(station(settings, agent) for agent in range(1, settings.agents + 1))
         radio = RadioSettings(dongles=dongles, path=path, stations=stations, loss=settings.loss, seed=settings.seed)
-        self.server = RadioServer(radio, self._hear_ground, lambda index, up: self.is_on(index + 1), listen=False)
+        self.server = RadioServer(radio, self._hear_ground, lambda index, up: self.is_on(index + 1))
         self._ticks = 0
         self._stopped = False
         super().__init__(app, settings, out, [*observers, self._answer_ground])
         for agent, receiver in enumerate(self.server.receivers, 1):
             receiver.on_packet = partial(self.receive_poll, agent)
-        for dongle in self.server.dongles:
-            dongle.between = self._between
+        self.air.peer_packet = self._between
         self.agenda.at(TICK_NS, self._log)
 
     def _open_air(self, seed: int) -> None:
-        self.agenda, self.air, self._first = self.server.agenda, self.server.air, self.server.first
+        self.air, self._first = self.server.air, self.server.first
 
     def stop(self) -> None:
         """End :meth:`fly`; also from a signal's handler."""
         self._stopped = True
 
     def fly(self, seconds: float) -> None:
-        self.server.listen()  # not before: the app has been compiled
         selector = selectors.SelectSelector()  # waits to the microsecond; epoll to the millisecond
-        selector.register(self.server.listener, selectors.EVENT_READ, None)
-        try:
-            while not self._stopped and self.time < seconds:
-                for key, _ in selector.select(WAIT_S):
-                    self.server.serve_host(key.data, selector)
-                self.server.origin_ns += max(0, self.server.now_ns() - self.now_ns - BEHIND_NS)
-                self.run(min(seconds, self.server.now_ns() / 1e9))
-        finally:
-            for key in list(selector.get_map().values()):
-                if key.data is not None:
-                    self.server.leave(key.data)
-            selector.close()
+        self.server.listen(selector)  # not before: the app has been compiled
+        while not self._stopped and self.time < seconds:
+            for key, _ in selector.select(WAIT_S):
+                key.data()
+            self.server.origin_ns += max(0, self.server.now_ns() - self.now_ns - BEHIND_NS)
+            self.run(min(seconds, self.server.now_ns() / 1e9))
 
     def close(self) -> None:
         super().close()
@@ -103,12 +94,12 @@ class LiveLaboratory(Laboratory):
     def deliver_packet(self, packet: PeerPacket, heard: set[int], frame: OnAir) -> None:
         if packet.sender:  # dongles in sniffer mode have it, too
             payload = bytes((0xFF, PEER_PORT | packet.raw[0])) + packet.data
-            tuned = self.settings.channel, self.settings.rate
-            self.server.dongles[0].overheard(heard, BROADCAST, payload, *tuned, frame)
+            tuning = Tuning(self.settings.channel, self.settings.rate, (BROADCAST, BROADCAST))
+            self.air.sniff(heard, BROADCAST, payload, tuning, frame)
         super().deliver_packet(packet, heard, frame)
 
-    def _between(self, packet: bytes, heard: set[int], tuned: Tuned, frame: OnAir) -> None:
-        if (tuned.channel, tuned.rate) == (self.settings.channel, self.settings.rate):
+    def _between(self, packet: bytes, heard: set[int], tuning: Tuning, frame: OnAir) -> None:
+        if tuning[:2] == (self.settings.channel, self.settings.rate):
             self.deliver_packet(PeerPacket(0, bytes((packet[1] & 0x0F,)) + packet[2:], 0), heard, frame)
 
     def _answer_ground(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
@@ -126,9 +117,8 @@ class LiveLaboratory(Laboratory):
         for index, (peer, receiver) in enumerate(zip(self.peers, self.server.receivers, strict=True)):
             if not peer.blocks or not self.is_on(index + 1):
                 continue
-            if not receiver.connected(now / 1e9):  # nobody is there: the log ends
+            if not receiver.connected(now / 1e9):  # no host: the log ends
                 peer.blocks.clear()
-                receiver.clear()
                 continue
             for packet in peer.log_packets(self._ticks, now / 1e9):
                 receiver.push(packet)
@@ -151,7 +141,7 @@ def main() -> int:
     if what.endswith(".json"):
         swarm = SwarmConfig.from_dict(json.loads(Path(what).read_text(encoding="utf-8")))
         flight = LiveOnboardSwarm(Path(place), 3, swarm, Path(out))
-        lab, finish = flight.lab, flight.finish
+        lab, finish = flight.lab, flight.summary
     else:
         lab = LiveLaboratory(Path(place), 3, read_app(what), LabSettings(agents=int(more[0])))
         finish = lab.summary

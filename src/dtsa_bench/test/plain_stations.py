@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dtsa_agent.core.kernel import ffi, lib
+from dtsa_agent.core.reference import datagram
 from dtsa_agent.core.reference import station as reference
 from dtsa_agent.core.reference.agent import Agent
 from dtsa_agent.core.reference.arithmetic import Vector
@@ -67,9 +68,9 @@ class PlainStations:
             # A vehicle flies on until its new process commands it.
             if agent.velocity != self.coasts.setdefault(call.host, agent.velocity):
                 agent.command, self.coasts[call.host] = agent.velocity, None
-            due, datagram = station.step(call.now_ns)
+            due, data = station.step(call.now_ns)
             expected = bytes(ffi.buffer(call.out, call.out_length)) if call.out_length else b""
-            assert (due, datagram.hex()) == (call.answer, expected.hex()), at
+            assert (due, data.hex()) == (call.answer, expected.hex()), at
             status, counts = call.status, station.counts
             assert station.hovers == status.hovers, at
             assert (counts.hears, counts.heard_by, counts.both, counts.needed, counts.others) == (
@@ -87,12 +88,12 @@ class PlainStations:
         index = call.answer - 1
         agent = Agent(index, rules_of(flight), Table(index + 1, self._start, self._away))
         agent.position, agent.goal = self._start[index], self._away[index]
-        link = reference.Link(bytes(c.link.header), True, c.link.names, c.link.flight_ns, c.link.trust_ns)
+        link = datagram.Link(bytes(c.link.header), True, c.link.names, c.link.flight_ns, c.link.trust_ns)
         begins_ns = None
         if flight.first_slot and host < flight.agents and host not in self.stations:
             begins_ns = call.now_ns + (1 - flight.first_slot) * c.slot_ns
         key = bytes(ffi.buffer(c.key, c.key_length)) if c.key else b""
-        settings = reference.Settings(
+        settings = datagram.Settings(
             index + 1, c.slot_ns, c.seed, link, key=key, session=c.session, begins_ns=begins_ns
         )  # fmt: skip
         return reference.Station(settings, agent.rules, agent, call.now_ns, c.main_every)

@@ -18,7 +18,7 @@ from rclpy.serialization import serialize_message
 
 from dtsa_agent.ros.common.checks import BadMessage
 from dtsa_agent.ros.common.messages import Fields, read_report
-from dtsa_channel_sim.ros.answers import Accounts, DeliveredFrame
+from dtsa_channel_sim.ros.answers import Accounts
 
 AGENTS, STEPS, LATEST = 5, 1, 50
 IDS, SLOTS = (2, 3), (7, 8)
@@ -43,7 +43,7 @@ def accounts() -> Accounts:
     """Accounts in which the frame of agent 1 in slot 6 was delivered to agent 2 alone."""
     made = Accounts(AGENTS, STEPS, keep=100)
     received = np.array([False, True, False, False, False])
-    made.deliver(6, 1, DeliveredFrame(b"frame", 61_000_000, received))
+    made.deliver(6, 1, b"frame", 61_000_000, received)
     return made
 
 

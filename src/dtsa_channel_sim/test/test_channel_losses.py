@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.model.draws import STATE, WordBlocks, sender_factors, threshold
+from dtsa_channel_sim.model.draws import STATE, WordBlocks, threshold
 from dtsa_channel_sim.model.gilbert import Chains, GilbertElliott
 
 MODELS = {
@@ -46,14 +46,14 @@ def test_receivers_and_links_are_independent():
     """Losses at two receivers, of two links to one receiver, and in neighbouring slots do not go together."""
     agents, slots, p = 8, 60_000, 0.2
     channel = Channel(ChannelConfig(agents=agents, loss=p, seed=2))
-    lost = np.array([channel._losses.lost(slot, 1)[0] for slot in range(slots)])
-    other = np.array([channel._losses.lost(slot, 2)[0] for slot in range(slots)])
+    lost = np.array([channel._losses.lost(slot, 1) for slot in range(slots)])
+    other = np.array([channel._losses.lost(slot, 2) for slot in range(slots)])
     bound = 5.0 / math.sqrt(slots)
     correlation = np.corrcoef(np.hstack([lost, other, np.roll(lost, 1, axis=0)]).T)
     np.fill_diagonal(correlation, 0.0)
     assert np.abs(correlation).max() < bound
     # Three links to one receiver at once, as the words share one root.
-    third = np.array([channel._losses.lost(slot, 3)[0] for slot in range(slots)])
+    third = np.array([channel._losses.lost(slot, 3) for slot in range(slots)])
     for receiver in range(agents):
         together = np.mean(lost[:, receiver] & other[:, receiver] & third[:, receiver])
         assert abs(together - p**3) < 5.0 * math.sqrt(p**3 / slots)
@@ -122,20 +122,19 @@ def test_chain_looked_at_anywhere_is_the_chain_walked(seed, loss, stretch, order
     agents, end = 200, 900  # three blocks of words
     words = WordBlocks(seed, STATE, agents)
     model = GilbertElliott.from_means(loss, stretch / (1 - loss))
-    factors = sender_factors(seed, STATE, agents)
     all_words = words.span(0, end)
     expected = walked(model, all_words, end)
-    by_link = walked(model, all_words * factors[7], end)
-    chains = Chains(model, words, factors)
+    by_link = walked(model, all_words * words.factors[7], end)
+    chains = Chains(model, words)
     draw = np.random.default_rng(seed)  # measured losses: a chain of its own for each link
     kept, share = draw.choice([0.0, 0.5, 0.95, 0.999], (agents, agents)), draw.uniform(0.05, 0.9, (agents, agents))
     measured = GilbertElliott(share, (1 - kept) * share, (1 - kept) * (1 - share))
     row = GilbertElliott(measured.bad_share[6], measured.enter[6], measured.leave[6])
-    by_measured_link, measured_chains = walked(row, all_words * factors[7], end), Chains(measured, words, factors)
+    by_measured_link, measured_chains = walked(row, all_words * words.factors[7], end), Chains(measured, words)
     for slot in order.sample(range(end), 25):
-        assert np.array_equal(chains.receivers(slot)[0], expected[slot])
-        assert np.array_equal(chains.links(slot, 7)[0], by_link[slot])
-        assert np.array_equal(measured_chains.links(slot, 7)[0], by_measured_link[slot])
+        assert np.array_equal(chains.bad(slot, 0), expected[slot])
+        assert np.array_equal(chains.bad(slot, 7), by_link[slot])
+        assert np.array_equal(measured_chains.bad(slot, 7), by_measured_link[slot])
 
 
 @pytest.mark.parametrize("model", MODELS)

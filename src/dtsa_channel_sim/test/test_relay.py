@@ -235,6 +235,7 @@ def test_what_is_wrong_is_named_and_nothing_ends(graph: Graph, tmp_path: Path) -
     ("robots", "channel", "line"),
     [
         ({"robot1": {"topics": {"x": {"type": "no_msgs/msg/Nothing"}}}, "robot2": {}}, {}, "no_msgs/msg/Nothing"),
+        ({"robot1": {"topics": {"x": {"type": "Pose"}}}, "robot2": {}}, {}, "'Pose'"),
         ({"robot1": {"topics": {"x": {}}}, "robot2": {}}, {"range_m": 5}, "robots.robot1.place"),
         ({"robot1": {"topics": {"x": {"bytes": 100}}}, "robot2": {}}, {"access": "tdma", "slot_ms": 0.3}, "a slot has"),
     ],

@@ -16,19 +16,21 @@ def content(channel: dict[str, Any] | None = None, topics: Any = None, **robot1:
 
 
 def test_a_file_says_all() -> None:
-    settings = RelaySettings.from_dict(
+    channel, robots, topics = RelaySettings.from_dict(
         content(
             {"access": "lease", "slot_ms": 5, "loss": 0.2},
             {"pose": {"type": "geometry_msgs/msg/PoseStamped", "bytes": 24, "to": ["robot3"]}, "/map": None},
             odometry="odom",
         )
-    )
-    assert settings.robots == ("robot1", "robot2", "robot3")
-    assert settings.places == (("odometry", "odom"), ("place", (1.0, 2.0, 3.0)), ("", None))
-    assert (settings.access.access, settings.channel.loss, settings.channel.slot_ns) == ("lease", 0.2, 5_000_000)
-    pose, room = settings.topics
-    assert (pose.source, pose.bytes, pose.receivers) == ("/robot1/pose", 24, (3,))
-    assert (room.source, room.bytes, room.receivers, room.type) == ("/map", None, (2, 3), "")
+    ).read()
+    assert list(robots) == ["robot1", "robot2", "robot3"]
+    assert [(robot.odometry, robot.place) for robot in robots.values()] == [
+        ("odom", None), (None, (1.0, 2.0, 3.0)), (None, None),
+    ]  # fmt: skip
+    assert (channel.access, channel.loss, channel.slot_ns) == ("lease", 0.2, 5_000_000)
+    pose, room = topics
+    assert (pose.source, pose.bytes, pose.receivers.tolist()) == ("/robot1/pose", 24, [False, False, True])
+    assert (room.source, room.bytes, room.receivers.tolist()) == ("/map", None, [False, True, True])
 
 
 @pytest.mark.parametrize(
@@ -37,6 +39,7 @@ def test_a_file_says_all() -> None:
         ({}, "robots"),
         ({"robots": {"a": {}, "b": {}}}, "robots"),
         ({"robots": {"a b": {}, "b": {}}}, "robots"),
+        ({"robots": {"a": {}, "/a": {}}}, "robots"),
         ({"robots": {"a": {"topics": {"x": {}}}}}, "channel.robots"),
         ({"robots": {"a": {"topics": {"/x": {}}}, "b": {"topics": {"/x": {}}}}}, "robots.b.topics./x"),
         (content() | {"robot": 1}, "robot"),
@@ -45,11 +48,11 @@ def test_a_file_says_all() -> None:
         (content({"loss": "much"}), "channel.loss"),
         (content({"range_m": 5}), "robots.robot1.place"),
         (content({"access": "error"}), "robots.robot1.place"),
-        (content({"access": "tdma", "slot_ms": 0.3}, {"pose": {"bytes": 200}}), "/robot1/pose: bytes"),
-        (content({"access": "lease", "slot_ms": 0.4}), "/robot1/pose: bytes"),
+        (content({"access": "tdma", "slot_ms": 0.3}, {"pose": {"bytes": 200}}), "robots.robot1.topics.pose.bytes"),
+        (content({"access": "lease", "slot_ms": 0.4}), "robots.robot1.topics.pose.bytes"),
         (content(topics={"pose": {"bytes": 0}}), "robots.robot1.topics.pose.bytes"),
         (content(topics={"pose": {"typ": "x"}}), "robots.robot1.topics.pose.typ"),
-        (content(topics={"pose": {"type": "Pose"}}), "robots.robot1.topics.pose.type"),
+        (content(topics={"pose": {"type": 3}}), "robots.robot1.topics.pose.type"),
         (content(topics={"pose": {"to": ["robot9"]}}), "robots.robot1.topics.pose.to"),
         (content(topics={"po se": {}}), "topics"),
         (content(topics={"po__se": {}}), "topics"),
@@ -60,6 +63,6 @@ def test_a_file_says_all() -> None:
 )
 def test_what_cannot_be_used_is_named(wrong: dict[str, Any], field: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        RelaySettings.from_dict(wrong)
+        RelaySettings.from_dict(wrong).read()
     assert caught.value.field.endswith(field)
     assert "\n" not in str(caught.value)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_channel_sim.relay.transport import ACCESS, COUNTS, Mask, RadioMessage, Transport, read_settings
+from dtsa_channel_sim.relay.transport import ACCESS, COUNTS, Mask, MessageChannel, RadioMessage, Transport
 
 MS = 1_000_000
 AGENTS = 6
@@ -16,7 +16,7 @@ Received = dict[tuple[int, int], list[int]]  # (sender, number): ids of those th
 
 
 def transport(agents: int = AGENTS, **settings: Any) -> Transport:
-    return Transport(*read_settings(settings, agents))
+    return Transport(MessageChannel.of(settings, agents))
 
 
 def message(carrier: Transport, sender: int, number: int, at_ns: int, length: int = 40) -> RadioMessage:
@@ -185,7 +185,7 @@ def test_nothing_is_missed_by_advancing_when_it_says(access: str) -> None:
 )  # fmt: skip
 def test_settings_that_cannot_be_are_named(settings: dict[str, Any], field: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        read_settings(settings, AGENTS)
+        MessageChannel.of(settings, AGENTS)
     assert caught.value.field == field
 
 

@@ -75,8 +75,8 @@ def messages() -> str:
     """The page of messages and services: each definition with its comments."""
     parts = [
         "# Messages and services\n\n"
-        "Package `dtsa_msgs`, as `ros2 interface show` prints it. Which node publishes what: [nodes](nodes.md). Which\n"
-        "topics a bag has: [bags](bag.md).\n\n"
+        "Package `dtsa_msgs`, as `ros2 interface show` prints it. Which node publishes what, and which\n"
+        "topics a bag has: [nodes and bags](nodes.md).\n\n"
     ]
     for path in (*sorted(_TYPES.glob("msg/*.msg")), *sorted(_TYPES.glob("srv/*.srv"))):
         text = path.read_text(encoding="utf-8").rstrip()

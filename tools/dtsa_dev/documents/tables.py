@@ -25,7 +25,7 @@ from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.settings import BatterySettings, GroundStationSettings, RobotSettings
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
-from dtsa_channel_sim.relay.transport import AccessSettings
+from dtsa_channel_sim.relay.transport import MessageChannel
 from dtsa_dev.records import EVIDENCE, read_record
 
 from . import table
@@ -228,7 +228,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "SwarmConfig": partial(_grouped, SwarmConfig),
     "SwarmConfig, leases": partial(settings_table, SwarmConfig, ["Frames and leases"]),
     "ChannelConfig": partial(settings_table, ChannelConfig),
-    "AccessSettings": partial(settings_table, AccessSettings),
+    "MessageChannel": partial(settings_table, MessageChannel, ["Access"]),
     "RunLimits": partial(settings_table, RunLimits),
     "RunConfig": partial(settings_table, RunConfig),
     "ClockConfig": partial(settings_table, ClockConfig),

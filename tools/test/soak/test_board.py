@@ -5,7 +5,6 @@ than 0.2 m to another, and all decisions made again are equal.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import subprocess
@@ -73,7 +72,8 @@ def fly(fault: str, seconds: float, seed: int, directory: Path, flags: Sequence[
     """One flight of virtual time with a fault; what the laboratory says of it."""
     settings = LabSettings(seed=seed, drift_ppm=50.0, **FAULTS[fault])  # type: ignore[arg-type]
     swarm = SwarmConfig(agents=AGENTS, policy="lease", seed=seed, targets_known=False)
-    with OnboardSwarm(swarm, settings, directory, enable_s=ENABLED_S, flags=flags) as flight:
+    app = read_app(APP, flags=tuple(flags))
+    with OnboardSwarm(swarm, settings, directory, enable_s=ENABLED_S, app=app) as flight:
         _change_goals(flight, seconds)
         _schedule_fault(flight, fault, seconds, seed)
         modes: list[int] = []
@@ -85,13 +85,12 @@ def fly(fault: str, seconds: float, seed: int, directory: Path, flags: Sequence[
         for at in np.arange(ENABLED_S + 2.0, seconds, LOOK_S).tolist():
             flight.lab.at(at, look)
         flight.lab.run(seconds)
-        return {**flight.finish(), "hover_share": modes.count(HOVER) / len(modes)}
+        return {**flight.summary(), "hover_share": modes.count(HOVER) / len(modes)}
 
 
 def _fly_with_sanitizers(fault: str, seconds: float, seed: int, directory: Path) -> dict[str, Any]:
     """The same in a process of its own: the sanitizers have to be there before Python is."""
-    app = read_app(APP)
-    environment = sanitizer_environment(dataclasses.replace(app, flags=(*app.flags, *SANITIZERS)))
+    environment = sanitizer_environment(read_app(APP, flags=SANITIZERS))
     words = [fault, str(seconds), str(seed), str(directory), *SANITIZERS]
     done = subprocess.run(
         [sys.executable, __file__, *words], env={**os.environ, **environment}, capture_output=True, text=True

@@ -36,19 +36,14 @@ class AgentGroup:
         self.slot = -1  # the present slot, -1: none
 
     def on_slot(self, slot: int) -> tuple[int, ...]:
-        """Begin a slot, and decide which local agents send in it; the slot before must be closed.
-
-        :returns: positions in ``swarm.ids`` of those that send; their frames are ``swarm.frame(position)``.
-        """
-        swarm = self.swarm
+        """Begin a slot, after the one before is closed; returns the positions in ``swarm.ids`` of those that send."""
         self.slot = slot
-        swarm.scenario.advance(slot, swarm)
-        return swarm.begin(slot)
+        self.swarm.scenario.advance(slot, self.swarm)
+        return self.swarm.begin(slot)
 
     def on_frames(self, slot: int, senders: Sequence[int], frames: Sequence[bytes], heard: Bytes) -> Bytes | None:
         """Receive the frames of a slot.
 
-        :param slot: the slot in which they arrive.
         :param senders: ids of the agents that sent, as the channel knows them.
         :param frames: their F frames; malformed and foreign ones are counted and change nothing.
         :param heard: (F, N) 1 where an agent (of all N) received a frame.
@@ -56,11 +51,11 @@ class AgentGroup:
         """
         swarm = self.swarm
         if swarm.shared:
-            own = [swarm.ids[index] for index in np.flatnonzero(swarm.sends)]
             received = heard.copy()
             received[np.arange(len(senders)), np.array(senders, dtype=np.intp) - 1] = 1  # a sender knows its own frame
             # A frame without receivers is known to its sender alone: the tables are no longer equal.
-            if all(agent in senders for agent in own) and received[:, swarm.local].all():
+            sent = {swarm.ids[index] for index in np.flatnonzero(swarm.sends)}
+            if sent <= set(senders) and received[:, swarm.local].all():
                 for frame in frames:
                     self.refused += 0 if swarm.hear(slot, frame) else len(swarm.ids) - 1
                 return None
@@ -118,20 +113,14 @@ class Agent:
         self.group = AgentGroup(self.swarm)
 
     def on_slot(self, slot: int) -> bytes | None:
-        """Begin a slot, and decide whether to send in it.
-
-        :param slot: its number; the slot before is closed if it is still open.
-        :returns: the frame to send, or None.
-        """
+        """Begin a slot, after closing an open one; returns the frame to send in it, or None."""
         if self.group.slot >= 0:
             self.on_slot_end()
         return self.swarm.frame(0) if self.group.on_slot(slot) else None
 
     def on_frame(self, data: bytes, slot: int) -> bool:
-        """Receive a frame.
+        """Receive a frame in a slot; malformed ones are counted in ``swarm.malformed`` and ignored.
 
-        :param data: its bytes; malformed ones are counted in ``swarm.malformed`` and ignored.
-        :param slot: the slot in which it arrived.
         :returns: whether it was accepted: a frame of this swarm and this slot time.
         """
         return self.swarm.hear(slot, data)
@@ -150,13 +139,10 @@ class Agent:
         return Decision(slot, int(swarm.chosen[0]), swarm.reason_name(0), float(swarm.score[0]), int(swarm.digest[0]))
 
     def command(self, position: Vector, velocity: Vector, slot: int, step: int = 0) -> Vector:
-        """Return the velocity to fly with.
+        """Return the commanded velocity for a control instant, 0 .. steps, of the present slot; m/s, frame map.
 
         :param position: own true position, m, frame map.
         :param velocity: own true velocity, m/s.
-        :param slot: the present slot.
-        :param step: control instant within the slot, 0 .. steps.
-        :returns: commanded velocity, m/s, frame map.
         """
         self.swarm.position[:, 0], self.swarm.velocity[:, 0] = position, velocity
         self.swarm.steer(slot, step)

@@ -18,22 +18,19 @@ MIN_KEY, MAX_KEY = 16, 32  # bytes
 
 
 class Authenticator:
-    """Seals own frames and opens those of others.
+    """Signs own frames and verifies those of others.
 
     :param key: 16 to 32 secret bytes, the same for all agents of a swarm.
     :param session: number of the flight, 0 to 2**64 - 1: choose a new one whenever the slots count from 0 again.
     :raises ConfigError: for a key or a session that is not usable.
     """
 
-    __slots__ = ("_key", "_session", "forged", "truncated")
-
     def __init__(self, key: bytes, session: int = 0) -> None:
         if not MIN_KEY <= len(key) <= MAX_KEY:
             raise ConfigError("auth_key", f"{len(key)} bytes", f"{MIN_KEY} to {MAX_KEY} bytes")
         self._key = key
         self.begin(session)
-        self.forged = 0  # frames whose tag was wrong: forged, changed, of another session or another slot
-        self.truncated = 0  # frames too short to have a tag
+        self.rejected = 0  # frames that were too short, forged, changed, of another session or of another slot
 
     @classmethod
     def from_hex(cls, text: str, session: int = 0) -> Authenticator:
@@ -60,36 +57,27 @@ class Authenticator:
         """The secret and the flight, for compiled code that does the same."""
         return self._key, self._session
 
-    @property
-    def rejected(self) -> int:
-        """Frames rejected so far, for whatever reason."""
-        return self.forged + self.truncated
-
-    def seal(self, data: bytes, slot: int, beside: bytes = b"") -> bytes:
-        """A frame, 1 to 56 bytes, with its tag, which also covers ``beside``: what is sent beside the frame.
+    def seal(self, data: bytes, slot: int) -> bytes:
+        """A frame, 1 to 56 bytes, with its tag.
 
         :raises LocalProtocolError: if frame and tag do not fit on the air.
         """
         if not 0 < len(data) <= FRAME_MAX - TAG_LENGTH:
             raise LocalProtocolError(f"a frame of {len(data)} bytes cannot be sealed: 1 to {FRAME_MAX - TAG_LENGTH}")
-        covered, tag = data + beside, ffi.new("uint8_t[]", TAG_LENGTH)
-        lib.dtsa_tag(self._key, len(self._key), self._session, slot, covered, len(covered), tag)
+        tag = ffi.new("uint8_t[]", TAG_LENGTH)
+        lib.dtsa_tag(self._key, len(self._key), self._session, slot, data, len(data), tag)
         return data + bytes(tag)
 
-    def open(self, data: bytes, slot: int, late: int = 0, beside: bytes = b"") -> bytes | None:
+    def open(self, data: bytes, slot: int, late: int = 0) -> bytes | None:
         """The frame without its tag, or None (and counted) if it is not authentic.
 
         :param slot: the slot in which it was heard.
         :param late: slots by which a frame may arrive after its own; 1 where agents have clocks of their own.
         """
-        if len(data) <= TAG_LENGTH:
-            self.truncated += 1
-            return None
-        frame, tag = data[:-TAG_LENGTH], data[-TAG_LENGTH:]
-        covered = frame + beside + tag
-        if lib.dtsa_open(self._key, len(self._key), self._session, slot, late, covered, len(covered)):
-            return frame
-        self.forged += 1
+        key = self._key
+        if len(data) > TAG_LENGTH and lib.dtsa_open(key, len(key), self._session, slot, late, data, len(data)):
+            return data[:-TAG_LENGTH]
+        self.rejected += 1
         return None
 
 

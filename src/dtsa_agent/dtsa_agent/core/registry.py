@@ -151,54 +151,51 @@ class Registry(Generic[Row]):
         return self.registered | self.plug_ins().keys()
 
     def _plug_in(self, name: str) -> tuple[Any, Row]:
-        if name not in self._plug_ins:
-            points = self.plug_ins()
-            if name not in points:
-                raise ConfigError(self.kind, name, ", ".join((*self.rows, *sorted(points))))
-            try:
-                factory = points[name].load()
-            except Exception as error:
-                source = f"{points[name].value} ({type(error).__name__}: {error})"
-                raise ConfigError(self.kind, name, f"a plug-in that can be imported, unlike {source}") from error
-            self._plug_ins[name] = factory, self._plug_in_row(name, factory)
-        return self._plug_ins[name]
+        if name in self._plug_ins:
+            return self._plug_ins[name]
+        points = self.plug_ins()
+        if name not in points:
+            raise ConfigError(self.kind, name, ", ".join((*self.rows, *sorted(points))))
+        try:
+            factory = points[name].load()
+        except Exception as error:
+            source = f"{points[name].value} ({type(error).__name__}: {error})"
+            raise ConfigError(self.kind, name, f"a plug-in that can be imported, unlike {source}") from error
+        return self._plug_ins.setdefault(name, (factory, self._plug_in_row(name, factory)))
 
 
-def _own_bytes(name: str, factory: Any) -> int:
-    own = getattr(factory, "own_bytes", 0)
-    if isinstance(own, bool) or not isinstance(own, int) or not 0 <= own <= MAX_OWN_BYTES:
-        raise ConfigError(f"{name}.own_bytes", own, f"0 to {MAX_OWN_BYTES}")
-    return own
-
-
-def _flag(name: str, factory: Any, attribute: str) -> bool:
-    value = getattr(factory, attribute, False)
-    if not isinstance(value, bool):
-        raise ConfigError(f"{name}.{attribute}", value, "True or False")
-    return value
+def _declared(name: str, factory: Any, flag: str) -> dict[str, Any]:
+    """What policies and estimators of other packages declare: a flag, and ``own_bytes``."""
+    values = {flag: getattr(factory, flag, False), "own_bytes": getattr(factory, "own_bytes", 0)}
+    if not isinstance(values[flag], bool):
+        raise ConfigError(f"{name}.{flag}", values[flag], "True or False")
+    if type(values["own_bytes"]) is not int or not 0 <= values["own_bytes"] <= MAX_OWN_BYTES:
+        raise ConfigError(f"{name}.own_bytes", values["own_bytes"], f"0 to {MAX_OWN_BYTES}")
+    return values
 
 
 def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
-    port = getattr(factory, "port", ("send", "received"))
+    def has(*methods: str) -> bool:
+        return all(callable(getattr(factory, method, None)) for method in methods)
+
+    port, declared = getattr(factory, "port", ("send", "received")), _declared(name, factory, "may_join")
     if not isinstance(port, (tuple, list)) or any(part not in PORT for part in port):
         raise ConfigError(f"{name}.port", port, "a tuple of some of " + ", ".join(PORT))
-    needs_everybody = callable(getattr(factory, "senders", None))
-    if needs_everybody and _own_bytes(name, factory):
+    needs_everybody, unslotted = has("senders"), has("wake")
+    if needs_everybody and declared["own_bytes"]:
         raise ConfigError(f"{name}.own_bytes", factory.own_bytes, "0 for a policy that looks into all agents")
-    unslotted = callable(getattr(factory, "wake", None))
-    if unslotted and "busy" in port and not all(callable(getattr(factory, part, None)) for part in ("sensed", "sent")):
+    reacts = unslotted and has("received")
+    if unslotted and "busy" in port and not has("sensed", "sent"):
         raise ConfigError(f"{name}.port", port, "'busy' with the methods sensed and sent beside wake")
-    reacts = unslotted and callable(getattr(factory, "received", None))
     if reacts and "busy" in port:
         raise ConfigError(f"{name}.port", port, "no 'busy' where a method received answers packets")
     return PolicyRow(
-        name, name, may_join=_flag(name, factory, "may_join"), port=tuple(port), own_bytes=_own_bytes(name, factory),
-        needs_everybody=needs_everybody, unslotted=unslotted, reacts=reacts,
-    )  # fmt: skip
+        name, name, port=tuple(port), needs_everybody=needs_everybody, unslotted=unslotted, reacts=reacts, **declared
+    )
 
 
 def _estimator_plug_in(name: str, factory: Any) -> EstimatorRow:
-    return EstimatorRow(name, _flag(name, factory, "needs_intent"), own_bytes=_own_bytes(name, factory))
+    return EstimatorRow(name, **_declared(name, factory, "needs_intent"))
 
 
 _POLICIES = (

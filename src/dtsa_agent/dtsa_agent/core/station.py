@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from .authentication import Authenticator
 from .errors import ConfigError
 from .frame import TAG_LENGTH, position_step
-from .kernel import ffi, lib
+from .kernel import ffi, fields_of, lib
 from .registry import POLICIES
 from .settings.config import SwarmConfig
 from .swarm import PRESENT_LEAVING, Swarm
@@ -24,13 +24,7 @@ VERDICTS = (
     "", "not ours", "length", "other settings", "no frame", "unknown agent", "rejected", "repeated", "other time",
     "own id", "too early",
 )  # fmt: skip
-LENGTH, OTHER_SETTINGS, NO_FRAME, REJECTED, REPEATED, OTHER_TIME, TOO_EARLY = (
-    VERDICTS[number]
-    for number in (
-        lib.DTSA_WRONG_LENGTH, lib.DTSA_OTHER_SETTINGS, lib.DTSA_NO_FRAME, lib.DTSA_REJECTED, lib.DTSA_REPEATED,
-        lib.DTSA_OTHER_TIME, lib.DTSA_TOO_EARLY,
-    )
-)  # fmt: skip
+_, _, LENGTH, OTHER_SETTINGS, NO_FRAME, _, REJECTED, REPEATED, OTHER_TIME, _, TOO_EARLY = VERDICTS
 STATES = ("listening", "alone", "joined")
 FLIES, LISTENS, IS_NEW, SAME_ID, NO_QUORUM = range(5)  # why an agent hovers
 ALL_BUT_ONE = "all-but-one"
@@ -70,13 +64,13 @@ class ParsedDatagram(NamedTuple):
 
 
 class Events(Protocol):
-    """Who records what happens to a station."""
+    """Recorder of what happens to a station."""
 
     def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
         """A slot is open: the agent has decided."""
 
     def restarted(self, slot: int) -> None:
-        """A slot is over, and the agent begins anew with the next."""
+        """A slot is over, and the agent restarts with the next."""
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         """The slot of a frame has begun, and the agent has heard it."""
@@ -86,37 +80,28 @@ class Events(Protocol):
 
 
 def check_slotted(policy: str) -> None:
-    """Refuse a policy whose frames may begin at any instant: only `simulate` and `sweep` carry those.
-
-    :raises ConfigError: if it is one.
-    """
+    """Raise a ConfigError for a policy whose frames may begin at any instant: only `simulate`, `sweep` carry those."""
     if POLICIES.row(policy).unslotted:
         raise ConfigError("policy", policy, "a policy with slots; those without fly in simulate and sweep only")
 
 
 def check_joinable(policy: str) -> None:
-    """Refuse a policy with which agents cannot come into a flight that is under way.
-
-    :raises ConfigError: if it is one.
-    """
+    """Raise a ConfigError for a policy with which agents cannot come into a flight that is under way."""
     row = POLICIES.row(policy)
     if not row.may_join or row.unslotted:
         joinable = [row.name for row in POLICIES.rows.values() if row.may_join]
         raise ConfigError("policy", policy, f"{', '.join(joinable)}, to come into a flight that is under way")
 
 
-def parse_quorum(text: str) -> tuple[int, float]:
-    """The quorum that a text means, for ``dtsa_station_settings``: number and share.
-
-    :raises ConfigError: for another text.
-    """
-    share = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)%", text) if isinstance(text, str) else None
-    if share and float(share[1]) <= 100.0:
-        return lib.DTSA_QUORUM_SHARE, float(share[1]) / 100.0
+def parse_quorum(text: object) -> tuple[int, float]:
+    """Number and share that a quorum's text means, for ``dtsa_station_settings``; ConfigError: none."""
+    match = re.fullmatch(r"([0-9]+)|([0-9]+(?:\.[0-9]+)?)%", text) if isinstance(text, str) else None
     if text == ALL_BUT_ONE:
         return lib.DTSA_QUORUM_ALL_BUT_ONE, 0.0
-    if isinstance(text, str) and text.isascii() and text.isdigit():
-        return int(text), 0.0
+    if match and match[1]:
+        return int(match[1]), 0.0
+    if match and float(match[2]) <= 100.0:
+        return lib.DTSA_QUORUM_SHARE, float(match[2]) / 100.0
     raise ConfigError("quorum", text, QUORUMS)
 
 
@@ -134,43 +119,32 @@ class StationSettings:
     """
 
     def __init__(
-        self,
-        config: SwarmConfig,
-        link: Link,
-        authenticator: Authenticator | None = None,
-        id: int = 1,
-        quorum: str = "0",
-        origin_ns: int | None = None,
-        listens: bool = False,
-        keeps_time: int = KEEPS_NOTHING,
-    ) -> None:
+        self, config: SwarmConfig, link: Link, authenticator: Authenticator | None = None, id: int = 1,
+        quorum: str = "0", origin_ns: int | None = None, listens: bool = False, keeps_time: int = KEEPS_NOTHING,
+    ) -> None:  # fmt: skip
         key, session = (b"", 0) if authenticator is None else authenticator.key_and_session
-        number, share = parse_quorum(quorum)
+        row, (number, share) = config.policy_row, parse_quorum(quorum)
         if number >= config.agents:
             raise ConfigError("quorum", quorum, f"at most {config.agents - 1}, the number of the others")
-        by_chance = lib.DTSA_SENDS_BY_CHANCE if "received" in config.policy_row.port else lib.DTSA_SENDS_IN_TURNS
-        self._key = ffi.new("uint8_t[]", key)
+        sends = lib.DTSA_SENDS_BY_CHANCE if "received" in row.port else lib.DTSA_SENDS_IN_TURNS
         begins = lib.DTSA_BEGINS_LATE if listens else lib.DTSA_BEGINS_TOGETHER
-        if origin_ns is None:
-            begins = lib.DTSA_BEGINS_LISTENING
-        rests = config.policy_row.probation  # agents that rest send in main anchors alone
+        self._key = ffi.new("uint8_t[]", key)
         lease = {"anchor_every": config.anchor_every, "main_every": config.main_every, "open_every": config.open_period}
         cycle = lib.dtsa_slot_cycle(ffi.new("dtsa_config *", {"agents": config.agents, "lease": lease}))
         self.c = ffi.new("dtsa_station_settings *", {
             "id": id, "agents": config.agents, "anchor_every": config.turn_every,
-            "main_every": config.main_every if rests else config.turn_every, "slot_cycle": cycle,
+            # Agents that rest send in main anchors alone.
+            "main_every": config.main_every if row.probation else config.turn_every, "slot_cycle": cycle,
             "extended": config.extended, "own_bytes": config.own_bytes,
             "frame_length": config.frame_length - (TAG_LENGTH if config.auth else 0),
             "position_step": position_step(config.extent_m), "slot_ns": config.slot_ns, "seed": config.seed,
-            "sends": lib.DTSA_SENDS_IN_ANCHORS if config.policy_row.extended else by_chance,
+            "sends": lib.DTSA_SENDS_IN_ANCHORS if row.extended else sends,
             "quorum": number, "quorum_share": share,
             "key": self._key if key else ffi.NULL, "key_length": len(key), "session": session,
-            "early_count": EARLY_COUNT, "begins": begins, "origin_ns": origin_ns or 0,
-            "keeps_time": keeps_time, "equal_tables": not config.policy_row.may_join,
-            "link": {
-                "header": link.header, "header_length": len(link.header), "says_late": link.says_late,
-                "names": link.names, "flight_ns": link.flight_ns, "trust_ns": link.trust_ns,
-            },
+            "early_count": EARLY_COUNT, "origin_ns": origin_ns or 0,
+            "begins": lib.DTSA_BEGINS_LISTENING if origin_ns is None else begins,
+            "keeps_time": keeps_time, "equal_tables": not row.may_join,
+            "link": fields_of("dtsa_link", link, header_length=len(link.header)),
         })  # fmt: skip
         self.names = link.names
         self.length: int = lib.dtsa_datagram_length(self.c)  # of all datagrams, bytes
@@ -217,18 +191,12 @@ class Station:
     """
 
     def __init__(
-        self,
-        swarm: Swarm,
-        settings: StationSettings,
-        now_ns: int,
-        before_slot: Callable[[int], None] | None = None,
-        events: Events | None = None,
-        every_frame: bool = True,
-    ) -> None:
+        self, swarm: Swarm, settings: StationSettings, now_ns: int, before_slot: Callable[[int], None] | None = None,
+        events: Events | None = None, every_frame: bool = True,
+    ) -> None:  # fmt: skip
         self.swarm, self._settings, self._before, self.events = swarm, settings, before_slot, events
         self.fault: BaseException | None = None  # raised in a callback; the caller of C raises it again
         self._moves = bool(swarm.scenario.moving[swarm.local[0]])
-        self._probation = swarm.config.policy_row.probation
         self._handle = ffi.new_handle(self)
         size = lib.dtsa_station_bytes(settings.c)
         self._memory = ffi.new("double[]", size // 8 + 1)
@@ -330,28 +298,21 @@ class Station:
     def open(self, slot: int, hovers: int, frame: Any, chosen: Any) -> int:
         swarm = self.swarm
         self.prepare(slot, hovers)
-        sends = swarm.begin(slot)
+        data = swarm.frame(0) if swarm.begin(slot) else b""
         chosen[0] = swarm.chosen[0]
-        if not sends:
-            return 0
-        data = swarm.frame(0)
         ffi.memmove(frame, data, len(data))
         return len(data)
 
-    def leave_air(self) -> int:
-        if not self.swarm.config.policy_row.says_leaving:
-            self.swarm.present[0] = 0
-            return 0
-        self.swarm.present[0] = PRESENT_LEAVING
-        return 1
+    def leave_air(self) -> bool:
+        self.swarm.leave(0)
+        return bool(self.swarm.present[0] == PRESENT_LEAVING)
 
     def probation(self) -> bool:
-        return self._probation and bool(self.swarm.lease_status(0)["probation"])
+        return self.swarm.config.policy_row.probation and bool(self.swarm.lease_status(0)["probation"])
 
 
 def _callback(act: Callable[..., Any], name: str) -> None:
     """Let C call a function of (station, ...); an exception ends the call of the station's user."""
-
     is_void = ffi.typeof(getattr(lib, name)).result.cname == "void"
 
     def call(context: Any, *values: Any) -> int | None:

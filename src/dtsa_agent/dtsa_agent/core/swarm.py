@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .authentication import Authenticator
 from .errors import ConfigError
-from .frame import FRAME_MAX, PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT, position_step
+from .frame import FRAME_MAX, position_step
 from .kernel import ffi, fields_of, lib, memory
 from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
 from .settings.config import SwarmConfig
@@ -26,11 +26,6 @@ Hashes = NDArray[np.uint32]
 
 PRESENT_LEAVING = lib.PRESENT_LEAVING  # in ``present``: will be switched off after a last frame
 DECAY_STEPS = 4096  # beyond this many control periods a vehicle has settled at its command (estimator intent)
-
-_NULL = ffi.NULL
-_begin, _fly, _hear, _end, _complete = (  # once a slot
-    lib.swarm_begin, lib.swarm_fly, lib.swarm_hear, lib.swarm_end, lib.swarm_complete,
-)  # fmt: skip
 
 
 @lru_cache(maxsize=16)
@@ -112,13 +107,9 @@ class Swarm:
     rejects: Annotated[NDArray[np.uint64], "2"]  # frames heard that were malformed, foreign
 
     def __init__(
-        self,
-        config: SwarmConfig,
-        scenario: Scenario | None = None,
-        local: Sequence[int] | None = None,
-        shared_table: bool = False,
-        observers: Sequence[int] | None = None,
-    ) -> None:
+        self, config: SwarmConfig, scenario: Scenario | None = None, local: Sequence[int] | None = None,
+        shared_table: bool = False, observers: Sequence[int] | None = None,
+    ) -> None:  # fmt: skip
         self.config = config
         self.scenario = make_scenario(config) if scenario is None else scenario
         check_extent(config, self.scenario)
@@ -153,7 +144,7 @@ class Swarm:
             raise ValueError(f"{ffi.string(fault).decode()}: out of range")
 
     def _check_ids(self, name: str, ids: tuple[int, ...]) -> None:
-        if list(ids) != sorted(set(ids)) or (ids and not 1 <= ids[0] <= ids[-1] <= self.config.agents):
+        if list(ids) != sorted({*ids} & {*range(1, self.config.agents + 1)}):
             raise ConfigError(name, ids, f"ascending ids from 1 to {self.config.agents}")
 
     def _check_company(self) -> None:
@@ -171,12 +162,11 @@ class Swarm:
     def _protocol(self, model: Any) -> dict[str, Any]:
         """Return the fields of ``dtsa_config``; what is not named here has the names of the settings."""
         config, key = self.config, self.scenario.policy_key
-        profile = PROFILE_PAPER_INTENT if config.estimator_row.needs_intent else PROFILE_PAPER
         lease = fields_of("dtsa_lease_config", config, open_every=config.open_period, share=config.lease_share)
         return fields_of(
             "dtsa_config", config, policy=POLICIES.number(config.policy), estimator=ESTIMATORS.number(config.estimator),
             avoider=model.kind, selection=SELECTIONS.index(config.selection),
-            profile=PROFILE_EXTENDED if config.extended else profile,
+            profile=config.profile,
             targets_known=config.targets_known and self.scenario.goals_known,
             position_step=position_step(config.extent_m), key=policy_key(config.seed) if key is None else key,
             avoid=model.avoider.to_dict(), lease=lease, start=memory(self._start),
@@ -207,7 +197,7 @@ class Swarm:
     def begin(self, slot: int) -> tuple[int, ...]:
         """Decide who sends in a slot, and encode the frames; returns the positions in ``ids`` of those that send."""
         self._slot = slot
-        count = _begin(self.kernel, slot)
+        count = lib.swarm_begin(self.kernel, slot)
         return (self._senders[0],) if count == 1 else tuple(self._senders[:count])
 
     def complete(self, slot: int, senders: Sequence[int], heard: Bytes | None = None, all_hear: bool = True) -> None:
@@ -217,10 +207,10 @@ class Swarm:
         :param heard: (F, V) which tables hear each frame; None: ``all_hear``, or none does.
         """
         if self.all_in_c and self.authenticator is None:
-            tables = _NULL if heard is None else heard.tobytes()
+            tables = ffi.NULL if heard is None else heard.tobytes()
             if heard is not None and heard.shape != (len(senders), len(self.observer)):
                 raise ValueError(f"heard: shape {heard.shape}")
-            _complete(self.kernel, slot, 0, all_hear, tables)
+            lib.swarm_complete(self.kernel, slot, 0, all_hear, tables)
             return
         frames = [self.frame(index) for index in senders]
         self.fly(slot)
@@ -231,14 +221,11 @@ class Swarm:
 
     def frame(self, local_index: int) -> bytes:
         """The frame that a local agent sends in this slot, as the air carries it; empty if it is silent."""
-        data = self._frames[local_index][: self._lengths[local_index]].tobytes()
-        return data if self.authenticator is None else self._sealed(data)
+        data = self._encoded(local_index)
+        return data if self.authenticator is None or not data else self.authenticator.seal(data, self._slot)
 
     def _encoded(self, local_index: int) -> bytes:
         return self._frames[local_index][: self._lengths[local_index]].tobytes()
-
-    def _sealed(self, data: bytes) -> bytes:
-        return data if self.authenticator is None or not data else self.authenticator.seal(data, self._slot)
 
     def drop(self, local_index: int) -> None:
         """The frame of this slot does not leave: its agent has been silent."""
@@ -246,7 +233,7 @@ class Swarm:
 
     def fly(self, slot: int) -> None:
         """Commands and motion of the local agents during a slot, :meth:`steer` and :meth:`move` at each instant."""
-        _fly(self.kernel, slot, 0)
+        lib.swarm_fly(self.kernel, slot, 0)
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         """Fill ``command`` for one control instant, 0 .. steps; ``estimate``: whether to fill the estimates first."""
@@ -281,27 +268,21 @@ class Swarm:
         :param data: malformed, foreign and forged frames are counted and change nothing.
         :param mask: (V,) which tables hear it; None: all.
         """
-        frame = data if self.authenticator is None else self.unseal(bytes(data), slot, late=1)
+        frame = data if self.authenticator is None else self.authenticator.open(bytes(data), slot, late=1)
         return frame is not None and self._receive(slot, frame, mask)
 
     def _receive(self, slot: int, frame: bytes, mask: Bytes | None) -> bool:
-        if mask is None:
-            return bool(_hear(self.kernel, slot, bytes(frame), len(frame), _NULL))
-        tables = mask.tobytes()
-        if len(tables) != len(self.observer):
+        tables = ffi.NULL if mask is None else mask.tobytes()
+        if mask is not None and len(tables) != len(self.observer):
             raise ValueError(f"mask: got {len(tables)} bytes")
-        return bool(_hear(self.kernel, slot, bytes(frame), len(frame), tables))
+        return bool(lib.swarm_hear(self.kernel, slot, bytes(frame), len(frame), tables))
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
         """Close a slot after all that was heard in it: counters, silence, and the senders' entries for themselves.
 
         :param collided: (V,) which receivers noticed a collision; None: they cannot tell it from silence.
         """
-        _end(self.kernel, slot)
-
-    def unseal(self, data: bytes, slot: int, late: int = 0) -> bytes | None:
-        """The frame in some bytes from the air; None (and counted) if its authentication fails."""
-        return data if self.authenticator is None else self.authenticator.open(data, slot, late)
+        lib.swarm_end(self.kernel, slot)
 
     def begin_session(self, session: int) -> None:
         """A flight begins: from now on only frames of its session are authentic. Without a key nothing changes."""

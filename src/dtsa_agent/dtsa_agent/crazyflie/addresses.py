@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 import socket
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
@@ -43,16 +44,6 @@ _WIRED = re.compile(r"(?P<scheme>usb|serial|prrt)://[\w./:-]+")
 
 class LinkError(DtsaError):
     """A connection could not be made; the text says why."""
-
-
-@dataclass(slots=True)
-class LinkCounters:
-    """What a link says about itself."""
-
-    sent: int = 0  # packets but for polls
-    quality: float = 1.0  # 0..1, of the radio
-    rssi: int = 0  # -dBm; 0: the link does not say
-    acknowledged: float = float("-inf")  # s, monotonic: when anything last came, or was acknowledged
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,37 +97,21 @@ def check_distinct(robots: Sequence[tuple[str, Address]]) -> None:
     for name, address in robots:
         link = address.link
         if address.port and ports.count((address.scheme, address.port)) > 1:
-            link = f"{address.scheme} {_resolve(address.host)}:{address.port}"
+            with suppress(OSError):
+                link = f"{address.scheme} {socket.gethostbyname(address.host)}:{address.port}"
         if link in names:
             allowed = f"a Crazyflie of its own ({names[link]} is reached by the same link)"
             raise ConfigError(f"robots.{name}.uri", address.uri, allowed)
         names[link] = name
 
 
-def _resolve(host: str) -> str:
-    try:
-        return socket.gethostbyname(host)
-    except OSError:
-        return host
-
-
 # -- what radios carry ------------------------------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class RadioUser:
-    """What one Crazyflie asks of its radio."""
-
-    name: str
-    address: Address
-    command_hz: float  # Hz, streamed commands and positions
-    log_hz: float  # Hz, state log
-
-
 @dataclass(frozen=True, slots=True)
 class RadioLoad:
     """What one radio, or one channel of several radios, has to carry."""
 
     medium: str  # radio, or channel of several radios
-    robots: tuple[str, ...]
+    count: int  # of Crazyflies
     exchanges: float  # wanted, per second
     seconds: float  # that they take, per second
     fitting_hz: float  # Hz: rate of commands and logs with which it would fit
@@ -146,14 +121,10 @@ class RadioLoad:
         """True when the radio can carry it."""
         return self.seconds <= 1.0
 
-    @property
-    def capacity(self) -> float:
-        """Exchanges per second that the radio can carry with these Crazyflies."""
-        return self.exchanges / self.seconds
-
     def __str__(self) -> str:
-        load = f"{len(self.robots)} Crazyflies, {self.exchanges:.0f} of {self.capacity:.0f} exchanges/s"
-        return f"{self.medium}: {load}: {'fits' if self.fits else f'DOES NOT FIT ({self.advice})'}"
+        capacity = self.exchanges / self.seconds
+        load = f"{self.medium}: {self.count} Crazyflies, {self.exchanges:.0f} of {capacity:.0f} exchanges/s"
+        return f"{load}: fits" if self.fits else f"{load}: DOES NOT FIT ({self.advice})"
 
     @property
     def advice(self) -> str:
@@ -162,56 +133,50 @@ class RadioLoad:
         return f"command_rate_hz and log_rate_hz {rate} fit" if rate >= WATCHDOG_HZ else "no rate fits"
 
 
-def exchange_s(rate: str, up: int = UP_BYTES, down: int = DOWN_BYTES, *, shared: bool = False) -> float:
+def exchange_s(rate: str, *, shared: bool) -> float:
     """Return how long an exchange takes, s.
 
     :param rate: a key of BITRATES.
-    :param up: bytes of the packet.
-    :param down: bytes of what the acknowledgement carries.
     :param shared: the radio has several Crazyflies.
     """
-    bits = 2 * OVERHEAD_BITS + 8 * (up + down)
+    bits = 2 * OVERHEAD_BITS + 8 * (UP_BYTES + DOWN_BYTES)
     return (REQUEST_S if shared else 0.0) + USB_S + 2 * TURN_S + bits / BITRATES[rate]
 
 
-def radio_loads(users: Iterable[RadioUser]) -> list[RadioLoad]:
-    """Return what each dongle has to carry, and what each channel has to that several dongles use."""
-    dongles: dict[str, list[RadioUser]] = {}
-    channels: dict[int, list[RadioUser]] = {}
-    for user in users:
-        if user.address.radio:
-            anywhere = f" on channel {user.address.channel}" if user.address.radio == ANY else ""
-            dongles.setdefault(f"radio {user.address.radio}{anywhere}", []).append(user)
-            channels.setdefault(user.address.channel, []).append(user)
-    loads = [_load(medium, dongles[medium]) for medium in sorted(dongles)]
+def radio_loads(users: Iterable[tuple[Address, float]]) -> list[RadioLoad]:
+    """Return what each dongle has to carry, and what each channel has to that several dongles use.
+
+    :param users: address of each Crazyflie, and the larger of the rates (Hz) of its packets each way.
+    """
+    media: dict[str, list[tuple[Address, float]]] = {}
+    channels: dict[int, list[tuple[Address, float]]] = {}
+    for address, rate in users:
+        if address.radio:
+            anywhere = f" on channel {address.channel}" if address.radio == ANY else ""
+            media.setdefault(f"radio {address.radio}{anywhere}", []).append((address, rate))
+            channels.setdefault(address.channel, []).append((address, rate))
+    media = dict(sorted(media.items()))
     for channel, sharing in sorted(channels.items()):
-        radios = sorted({user.address.radio for user in sharing})
+        radios = sorted({address.radio for address, _ in sharing})
         if len(radios) > 1:
-            loads.append(_load(f"channel {channel} of radios {', '.join(radios)}", sharing))
+            media[f"channel {channel} of radios {', '.join(radios)}"] = sharing
+    loads = []
+    for medium, members in media.items():
+        times = [EXCHANGES * exchange_s(address.rate, shared=len(members) > 1) for address, _ in members]
+        rates = [rate + WATCHDOG_HZ + ORDERS_HZ for _, rate in members]
+        seconds = sum(time * rate for time, rate in zip(times, rates, strict=True))
+        fitting_hz = 1.0 / sum(times) - WATCHDOG_HZ - ORDERS_HZ
+        loads.append(RadioLoad(medium, len(members), EXCHANGES * sum(rates), seconds, fitting_hz))
     return loads
 
 
-def _load(medium: str, users: list[RadioUser]) -> RadioLoad:
-    times = [EXCHANGES * exchange_s(user.address.rate, shared=len(users) > 1) for user in users]
-    rates = [max(user.command_hz, user.log_hz) + WATCHDOG_HZ + ORDERS_HZ for user in users]
-    return RadioLoad(
-        medium, tuple(user.name for user in users), EXCHANGES * sum(rates),
-        sum(time * rate for time, rate in zip(times, rates, strict=True)), 1.0 / sum(times) - WATCHDOG_HZ - ORDERS_HZ,
-    )  # fmt: skip
-
-
-def check_budget(loads: Sequence[RadioLoad], *, force: bool) -> None:
-    """Refuse what cannot fit.
-
-    :param force: let it pass.
-    :raises ConfigError: a radio or a channel has too much to carry.
-    """
+def check_budget(loads: Iterable[RadioLoad], *, force: bool) -> None:
+    """Refuse what cannot fit, unless that is forced; ConfigError: a radio or a channel has too much to carry."""
     for load in loads:
         if not load.fits and not force:
-            most = int(len(load.robots) / load.seconds)
+            most, capacity = int(load.count / load.seconds), load.exchanges / load.seconds
             raise ConfigError(
-                load.medium,
-                f"{len(load.robots)} Crazyflies with {load.exchanges:.0f} exchanges/s",
-                f"{load.capacity:.0f} exchanges/s, {most} Crazyflies at these rates: {load.advice}, use more radios "
+                load.medium, f"{load.count} Crazyflies with {load.exchanges:.0f} exchanges/s",
+                f"{capacity:.0f} exchanges/s, {most} Crazyflies at these rates: {load.advice}, use more radios "
                 "on channels of their own or a higher data rate, or set force_budget",
-            )
+            )  # fmt: skip

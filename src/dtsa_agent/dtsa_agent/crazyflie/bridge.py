@@ -10,11 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import make_scenario
 
 from .addresses import WATCHDOG_HZ, check_budget, parse_address
@@ -22,12 +23,11 @@ from .link import SIMULATED_RADIO, require_cflib
 from .onboard import OnboardSetup, app_orders, app_parameters, key_of
 from .safety import Action, RequiredAction, SafetyMonitor
 from .settings import SwarmSettings
-from .state import State, VehicleState
-from .vehicle import OFF, CrazyflieVehicle, Snapshot
+from .state import OFF, WATCHED_OVER, State, VehicleState
+from .vehicle import CrazyflieVehicle
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
-LAND_WAIT = frozenset({State.ARMED, State.FLYING, State.LANDING})
 
 
 class Ownership:
@@ -39,15 +39,13 @@ class Ownership:
     """
 
     def __init__(self, robots: Iterable[tuple[str, str]]) -> None:
-        self._files: list[int] = []
+        self._files = ExitStack()
         directory = Path(tempfile.gettempdir()) / f"dtsa-crazyflies-{os.getuid()}"
-        with suppress(FileExistsError):
-            directory.mkdir(mode=0o700)
+        directory.mkdir(mode=0o700, exist_ok=True)
         for name, uri in robots:
             air = os.environ.get(SIMULATED_RADIO, "") if uri.startswith("radio://") else ""  # one of several
-            address = air + parse_address(uri).link
-            file = os.open(directory / hashlib.sha256(address.encode()).hexdigest(), os.O_CREAT | os.O_RDWR, 0o600)
-            self._files.append(file)
+            digest = hashlib.sha256((air + parse_address(uri).link).encode()).hexdigest()
+            file = self._files.enter_context((directory / digest).open("w"))
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
@@ -56,8 +54,7 @@ class Ownership:
 
     def release(self) -> None:
         """Others may have them."""
-        while self._files:
-            os.close(self._files.pop())
+        self._files.close()
 
 
 class Bridge:
@@ -85,55 +82,46 @@ class Bridge:
         cache = Path(station.toc_cache or caches / "dtsa/crazyflie").expanduser()
         cache.mkdir(parents=True, exist_ok=True)
         self.vehicles = {r.name: CrazyflieVehicle(r, station, cache, log, on_state) for r in settings.robots}
-        self._prepare_apps()
+        if (swarm := settings.swarm) is not None:
+            self._prepare_apps(swarm)
         from .drivers import DongleSet  # needs cflib
 
         self.radios = DongleSet(((r.name, r.address) for r in settings.robots), log)
-        self.radios.keep_spare()
         self.monitor = SafetyMonitor(station.safety)
-        self._heartbeat: float | None = None
+        self.heartbeat: float | None = None  # s, monotonic: the ground station's last; its silence stops the swarm
         self._closing = threading.Event()
         self._guard = threading.Thread(target=self._run_rules, name="safety", daemon=True)
-        self.slowest_tick = 0.0  # s, longest time between two applications of the rules
         self._guard.start()
 
     # -- connection -------------------------------------------------------------------------------------------------
-    def connect(self, names: Iterable[str] | None = None, stop: Callable[[], bool] = lambda: False) -> list[str]:
-        """Connect some (None: all) in parallel and wait; the names of those that are not connected.
+    def connect(self, stop: Callable[[], bool] = lambda: False) -> list[str]:
+        """Connect all in parallel and wait; the names of those that are not connected.
 
         :param stop: asked ten times a second; True ends the wait.
         """
-        vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
         waiting = threading.Semaphore(0)
-        for vehicle in vehicles:
+        for vehicle in self.vehicles.values():
             vehicle.connect(waiting.release)
-        for _ in vehicles:
+        for _ in self.vehicles:
             while not (waiting.acquire(timeout=0.1) or stop()):
                 pass
-        return [v.name for v in vehicles if v.state in OFF]
+        return [v.name for v in self.vehicles.values() if v.state in OFF]
 
-    def _prepare_apps(self) -> None:
+    def _prepare_apps(self, swarm: SwarmConfig) -> None:
         """What agents on board are told, where they steer."""
-        if (swarm := self.settings.swarm) is None:
-            return
-        key, scenario, station = key_of(swarm), make_scenario(swarm), self.settings.station
+        scenario, station = make_scenario(swarm), self.settings.station
         values = app_parameters(swarm, scenario, station.room_origin_in_world[2])
+        orders = app_orders(swarm, scenario, key_of(swarm))
         for vehicle in self.vehicles.values():
             own = {name: vehicle.robot.firmware_params.get(name, value) for name, value in values.items()}
-            vehicle.link.board = OnboardSetup(own, app_orders(swarm, scenario, key), station.on_board.polls_hz)
+            vehicle.link.board = OnboardSetup(own, orders, station.on_board.polls_hz)
 
-    def start_agents(self, names: Iterable[str] | None = None) -> str:
+    def start_agents(self) -> str:
         """Start the agents on board of those that are connected, all at once; why some do not start, or ""."""
-        vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
-        vehicles = [v for v in vehicles if v.link.connected and v.link.board is not None]
+        vehicles = [v for v in self.vehicles.values() if v.link.connected and v.link.board is not None]
         with ThreadPoolExecutor(max(1, len(vehicles))) as pool:
             problems = pool.map(lambda vehicle: vehicle.link.start_agent(), vehicles)
             return "; ".join(f"{v.name}: {text}" for v, text in zip(vehicles, problems, strict=True) if text)
-
-    @property
-    def connected(self) -> int:
-        """Number of connected Crazyflies."""
-        return sum(v.state not in OFF for v in self.vehicles.values())
 
     def reconnect(self, name: str) -> str:
         """Connect one again that is lost, disconnected or stopped; why not, or an empty text. Does not wait."""
@@ -172,10 +160,8 @@ class Bridge:
     def why_no_takeoff(self) -> str:
         """Why the swarm may not take off; empty if it may."""
         needed = self.settings.station.min_connected
-        usable = sum(v.state in (State.READY, State.ARMED, State.FLYING, State.LANDING) for v in self.vehicles.values())
-        if usable < needed:
-            return f"{usable} Crazyflies are usable, min_connected is {needed}"
-        return ""
+        usable = sum(v.state in (State.READY, *WATCHED_OVER) for v in self.vehicles.values())
+        return f"{usable} Crazyflies are usable, min_connected is {needed}" if usable < needed else ""
 
     def land_all(self, reason: str) -> None:
         """Land all that fly."""
@@ -190,22 +176,11 @@ class Bridge:
         for vehicle in self.vehicles.values():
             vehicle.stop(reason)
 
-    def note_heartbeat(self) -> None:
-        """The ground station is alive. From the first one on its silence stops the swarm."""
-        self._heartbeat = time.monotonic()
-
-    def end_heartbeat(self) -> None:
-        """The ground station ends its watch in good order."""
-        self._heartbeat = None
-
     # -- safety -----------------------------------------------------------------------------------------------------
     def _run_rules(self) -> None:
-        last = time.monotonic()
-        keep_alive = last
+        keep_alive = 0.0
         while not self._closing.wait(TICK_S):
             now = time.monotonic()
-            self.slowest_tick = max(self.slowest_tick, now - last)
-            last = now
             feed = now >= keep_alive
             keep_alive = now + 1.0 / WATCHDOG_HZ if feed else keep_alive
             try:
@@ -215,26 +190,24 @@ class Bridge:
 
     def _apply_rules(self, now: float, feed: bool) -> None:
         vehicles = self.vehicles.values()
-        age = None if self._heartbeat is None else now - self._heartbeat
-        for vehicle in vehicles if feed else ():
-            vehicle.feed_watchdog(now, self.settings.station.safety.emergency_watchdog)
-        for verdict in self.monitor.check(now, [v.watched_state(now) for v in vehicles], age):
-            self._carry_out(verdict, now)
+        age = None if self.heartbeat is None else now - self.heartbeat
+        for required in self.monitor.check(now, [v.watched_state(now) for v in vehicles], age):
+            self._carry_out(required, now)
         for vehicle in vehicles:
-            vehicle.tick(now)
+            vehicle.tick(now, feed)
 
-    def _carry_out(self, verdict: RequiredAction, now: float) -> None:
-        action, reason = verdict.action, verdict.reason
+    def _carry_out(self, required: RequiredAction, now: float) -> None:
+        action, reason = required.action, required.reason
         level = "warn" if action in (Action.WARN, Action.HOLD) else "error"
-        self._log(level, f"{verdict.name or 'all'}: {verdict.rule}: {reason}: {action.value}")
+        self._log(level, f"{required.name or 'all'}: {required.rule}: {reason}: {action.value}")
         if action is Action.STOP_ALL:
             self.stop_all(reason)
             return
-        vehicle = self.vehicles[verdict.name]
+        vehicle = self.vehicles[required.name]
         if action is Action.WARN:
             vehicle.action = reason
         elif action is Action.HOLD:
-            vehicle.hold_place(reason, stale=True, until_seen=verdict.rule == "positions")
+            vehicle.hold_place(reason, stale=True, until_seen=required.rule == "positions")
         elif action is Action.LAND:
             vehicle.land(reason)
         elif action is Action.LOST:
@@ -243,17 +216,12 @@ class Bridge:
             vehicle.stop(reason)
 
     # -- the end ----------------------------------------------------------------------------------------------------
-    def snapshots(self) -> list[Snapshot]:
-        """State of all."""
-        now = time.monotonic()
-        return [v.snapshot(now) for v in self.vehicles.values()]
-
     def names_in_air(self, now: float) -> list[str]:
         """Names of those whose link must not be closed now."""
         return [
             v.name
             for v in self.vehicles.values()
-            if v.state in LAND_WAIT or (v.state == State.LOST and v.log_age(now) < GROUNDED_S and v.link.connected)
+            if v.state in WATCHED_OVER or (v.state == State.LOST and v.log_age(now) < GROUNDED_S and v.link.connected)
         ]
 
     def wait_landed(self, stop: Callable[[], bool]) -> list[str]:

@@ -13,20 +13,17 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
 from .safety import SafetySettings, outside_fence
-from .state import Quaternion, Vector, to_world
+from .state import Vector, to_world
 
 VELOCITY_WORLD, POSITION, FULL_STATE = "velocity_world", "position", "full_state"
 FULL_STATE_LIMIT = 32.767  # m, m/s, m/s^2, rad/s: 16 bit numbers in thousandths
-MAX_CLOCK_S = 0.1  # a sender's clock that is wrong makes a command at most so much older
 _POLL_NS = 100_000_000  # the end is noticed after this time at the latest
-_BURST = 4  # messages taken from one topic in one round; only the latest one counts anyway
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,58 +39,44 @@ class Setpoint:
 
 def velocity_world(velocity: Vector, yaw_rate: float, stamp: float) -> Setpoint:
     """Return a velocity, m/s along the world's axes, with a yaw rate in degrees/s."""
-    return Setpoint(VELOCITY_WORLD, (*_finite(velocity), *_finite((yaw_rate,))), stamp, speed=math.hypot(*velocity))
-
-
-def position(place: Vector, yaw: float, stamp: float) -> Setpoint:
-    """Return a place, m (world), with a yaw in degrees."""
-    return Setpoint(POSITION, (*_finite(place), *_finite((yaw,))), stamp, place)
-
-
-def full_state(
-    place: Vector, velocity: Vector, acceleration: Vector, orientation: Quaternion, rates: Vector, stamp: float
-) -> Setpoint:
-    """Position m, velocity m/s, acceleration m/s^2 (world), attitude (x, y, z, w), body rates rad/s (REP-103).
-
-    Numbers beyond what the packet's 16 bits can say are kept at their limit: an overflow would send the Crazyflie the
-    other way. An orientation of length zero (an unset message) means level, heading along x.
-    """
-    vectors = [tuple(_saturate(v) for v in _finite(vector)) for vector in (place, velocity, acceleration)]
-    roll_rate, pitch_rate, yaw_rate = (_saturate(v) for v in _finite(rates))
-    q = _finite(orientation)
-    norm = math.sqrt(sum(c * c for c in q))
-    q = tuple(c / norm for c in q) if norm > 1e-6 else (0.0, 0.0, 0.0, 1.0)
-    arguments = (*vectors, q, roll_rate, pitch_rate, yaw_rate)
-    return Setpoint(FULL_STATE, arguments, stamp, place, math.hypot(*velocity))
-
-
-def _saturate(value: float) -> float:
-    return min(FULL_STATE_LIMIT, max(-FULL_STATE_LIMIT, value))
-
-
-def _finite(values: tuple[float, ...]) -> tuple[float, ...]:
-    if not all(math.isfinite(v) for v in values):
-        raise ValueError("a command with a number that is not finite")
-    return values
+    return Setpoint(VELOCITY_WORLD, (*velocity, yaw_rate), stamp, speed=math.hypot(*velocity))
 
 
 def of_message(kind: str, m: Any, origin: Vector, stamp: float) -> Setpoint:
-    """Return the set-point of a message.
+    """Return the set-point of a message of a kind.
+
+    Numbers of a full state beyond what the packet's 16 bits can say are kept at their limit: an overflow would send the
+    Crazyflie the other way. An orientation of length zero (an unset message) means level, heading along x.
 
     :param origin: m, where the world sees the origin of `map`.
     :raises ValueError: a number is not finite.
     """
     if kind == VELOCITY_WORLD:
-        return velocity_world((m.vel.x, m.vel.y, m.vel.z), m.yaw_rate, stamp)
-    shift = origin if m.header.frame_id == "map" else (0.0, 0.0, 0.0)
+        numbers = [m.vel.x, m.vel.y, m.vel.z, m.yaw_rate]
+    elif kind == POSITION:
+        numbers = [m.x, m.y, m.z, m.yaw]
+    else:
+        vectors = m.pose.position, m.twist.linear, m.acc, m.twist.angular
+        q = m.pose.orientation
+        numbers = [*(c for v in vectors for c in (v.x, v.y, v.z)), q.x, q.y, q.z, q.w]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("a command with a number that is not finite")
+    if kind == VELOCITY_WORLD:
+        return velocity_world((numbers[0], numbers[1], numbers[2]), numbers[3], stamp)
+    place = numbers[0], numbers[1], numbers[2]
+    if m.header.frame_id == "map":
+        place = to_world(place, origin)
     if kind == POSITION:
-        return position(to_world((m.x, m.y, m.z), shift), m.yaw, stamp)
-    p, q, v, w, a = m.pose.position, m.pose.orientation, m.twist.linear, m.twist.angular, m.acc
-    place = to_world((p.x, p.y, p.z), shift)
-    return full_state(place, (v.x, v.y, v.z), (a.x, a.y, a.z), (q.x, q.y, q.z, q.w), (w.x, w.y, w.z), stamp)
+        return Setpoint(kind, (*place, numbers[3]), stamp, place)
+    fixed = [min(FULL_STATE_LIMIT, max(-FULL_STATE_LIMIT, number)) for number in (*place, *numbers[3:12])]
+    norm = math.hypot(*numbers[12:])
+    orientation = tuple(c / norm for c in numbers[12:]) if norm > 1e-6 else (0.0, 0.0, 0.0, 1.0)
+    position, velocity, acceleration = (tuple(fixed[k : k + 3]) for k in (0, 3, 6))
+    arguments = (position, velocity, acceleration, orientation, *fixed[9:])
+    return Setpoint(kind, arguments, stamp, place, math.hypot(*numbers[3:6]))
 
 
-def check_stream(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> None:
+def check_setpoint(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> None:
     """Refuse a streamed command that leads out of the room, or is too fast; ValueError: why it is refused."""
     if setpoint.speed > fastest_mps:
         limit = f"(station.max_stream_mps is {fastest_mps:g})"
@@ -102,49 +85,22 @@ def check_stream(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fas
         raise ValueError(f"a command to {problem} is refused")
 
 
-class CommandInput:
-    """Takes the messages of one topic of one vehicle.
-
-    :param controls: the vehicle's `Controls`.
-    :param station: the station's settings.
-    :param warn: called with a line about a command that does not count, at a limited rate.
-    """
-
-    def __init__(self, kind: str, controls: Any, station: Any, name: str, warn: Callable[[str], None]) -> None:
-        self._kind, self._controls, self._station, self._name, self._warn = kind, controls, station, name, warn
-
-    def __call__(self, message: Any, info: Any) -> None:
-        station = self._station
-        # The command is as old as its publication.
-        age = (time.time_ns() - info["source_timestamp"]) * 1e-9
-        stamp = time.monotonic() - min(max(age, 0.0), MAX_CLOCK_S)
-        try:
-            setpoint = of_message(self._kind, message, station.room_origin_in_world, stamp)
-            check_stream(setpoint, station.safety, station.room_origin_in_world, station.max_stream_mps)
-        except ValueError as error:
-            self._controls.refused += 1
-            self._warn(f"{self._name}: {error}")
-            return
-        if not self._controls.command(setpoint):
-            self._warn(f"{self._name}: commands are not accepted now ({self._controls.state_text})")
-
-
-class CommandThread:
-    """Takes messages and calls back, in its own thread.
+class TopicThread:
+    """Takes the newest messages of topics and calls back, in its own thread.
 
     :param node: subscribes; must not be in an executor.
     """
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node: Any, name: str) -> None:
         self._node = node
-        self._subscriptions: list[tuple[Any, type, Callable[[Any, Any], None]]] = []
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="commands", daemon=True)
+        self._subscriptions: list[tuple[Any, type, Callable[[Any, float], None]]] = []
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
-    def subscribe(self, kind: type, topic: str, callback: Callable[[Any, Any], None], qos: Any) -> None:
+    def subscribe(self, kind: type, topic: str, callback: Callable[[Any, float], None], qos: Any) -> None:
         """Before `start`: take the messages of a topic.
 
-        :param callback: gets a message and its information (`source_timestamp` in ns).
+        :param callback: gets a message, and when it was published (s, Unix time).
         """
         subscription = self._node.create_subscription(kind, topic, lambda message: None, qos)
         self._subscriptions.append((subscription.handle, kind, callback))
@@ -156,7 +112,7 @@ class CommandThread:
 
     def close(self) -> None:
         """End of the thread and its node."""
-        self._over.set()
+        self._closing.set()
         if self._thread.is_alive():
             self._thread.join(2.0)
         self._node.destroy_node()
@@ -169,23 +125,13 @@ class CommandThread:
             for handle in (context, *(handle for handle, _, _ in self._subscriptions)):
                 stack.enter_context(handle)
             wait_set = _rclpy.WaitSet(len(self._subscriptions), 0, 0, 0, 0, 0, context)
-            while not self._over.is_set() and self._node.context.ok():
+            while not self._closing.is_set() and self._node.context.ok():
                 wait_set.clear_entities()
                 for handle, _, _ in self._subscriptions:
                     wait_set.add_subscription(handle)
                 wait_set.wait(_POLL_NS)
                 ready = set(wait_set.get_ready_entities("subscription"))
                 for handle, kind, callback in self._subscriptions:
-                    if handle.pointer in ready:
-                        self._drain(handle, kind, callback)
-
-    @staticmethod
-    def _drain(handle: Any, kind: type, callback: Callable[[Any, Any], None]) -> None:
-        latest = None
-        for _ in range(_BURST):
-            taken = handle.take_message(kind, False)
-            if taken is None:
-                break
-            latest = taken
-        if latest is not None:
-            callback(*latest)
+                    taken = handle.take_message(kind, False) if handle.pointer in ready else None
+                    if taken is not None:
+                        callback(taken[0], taken[1]["source_timestamp"] * 1e-9)

@@ -22,6 +22,7 @@ Delete when: cflib's drivers keep the newest set-point only, outlive a silence a
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import socket
 import threading
@@ -37,7 +38,7 @@ from cflib.crtp.crtpstack import CRTPPacket
 from cflib.crtp.exceptions import WrongUriType
 from cflib.drivers.crazyradio import Crazyradio, get_serials
 
-from .addresses import ANY, BITRATES, Address, LinkCounters, parse_address
+from .addresses import ANY, BITRATES, Address, parse_address
 
 Report = Callable[[str, str], None]  # level and line
 COMMAND, SETPOINT, POSITION, REQUEST, EMPTY = "command", "setpoint", "position", "request", "empty"
@@ -75,89 +76,64 @@ class Mailbox:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._commands: deque[tuple[bytes, float]] = deque(maxlen=MOST_COMMANDS)
-        self._requests: deque[bytes] = deque()
+        self.commands: deque[tuple[bytes, float]] = deque(maxlen=MOST_COMMANDS)  # with when they came (s, monotonic)
+        self.requests: deque[bytes] = deque()
         self._newest: dict[str, tuple[bytes, float]] = {}
         self._turn = 0
+
+    def __bool__(self) -> bool:
+        return bool(self.commands or self.requests or self._newest)
 
     def add(self, packet: bytes) -> None:
         """Add a packet; an order ends the stream of set-points, an emergency stop empties the box."""
         kind, start = kind_of(packet), bytes((packet[0] & HEADER, *packet[1:2]))
         with self._lock:
             if kind == REQUEST:
-                self._requests.append(packet)
+                self.requests.append(packet)
             elif kind != COMMAND:
                 self._newest[kind] = packet, time.monotonic()
-            elif start not in WATCHDOG or all(packet != waiting for waiting, _ in self._commands):
+            elif start not in WATCHDOG or all(packet != waiting for waiting, _ in self.commands):
                 if start in EMERGENCY:
-                    self._requests.clear()
-                    self._commands = deque((c for c in self._commands if c[0] == packet), MOST_COMMANDS)
+                    self.requests.clear()
+                    self.commands = deque((c for c in self.commands if c[0] == packet), MOST_COMMANDS)
                 if start in EMERGENCY or start[0] in (END_OF_STREAM, HIGH_LEVEL):
                     self._newest.pop(SETPOINT, None)
-                self._commands.append((packet, time.monotonic()))
+                self.commands.append((packet, time.monotonic()))
 
     def pop(self, kind: str = "") -> tuple[str, bytes] | None:
         """Return the next packet, of one kind or of any, and its kind; None: there is none."""
         with self._lock:
             now = time.monotonic()
             self._newest = {kind: both for kind, both in self._newest.items() if now - both[1] < DEAF_S}
-            while self._commands and kind in ("", COMMAND):
-                packet, since = self._commands.popleft()
+            while self.commands and kind in ("", COMMAND):
+                packet, since = self.commands.popleft()
                 if now - since < COMMAND_LIFE_S or packet[1:2] == b"\x03":
                     return COMMAND, packet
             for number in range(self._turn, self._turn + len(TURNS)):
                 turn = TURNS[number % len(TURNS)]
-                waits = self._requests if turn == REQUEST else turn in self._newest
+                waits = self.requests if turn == REQUEST else turn in self._newest
                 if waits and kind in ("", turn):
                     self._turn = (number + 1) % len(TURNS)
-                    return turn, self._requests.popleft() if turn == REQUEST else self._newest.pop(turn)[0]
+                    return turn, self.requests.popleft() if turn == REQUEST else self._newest.pop(turn)[0]
         return None
 
-    def return_request(self, request: bytes) -> None:
-        """Return a request that may not have arrived."""
-        with self._lock:
-            self._requests.appendleft(request)
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing waits."""
-        return not (self._commands or self._requests or self._newest)
-
-    @property
-    def has_commands(self) -> bool:
-        """Whether commands wait."""
-        return bool(self._commands)
-
-
-class _Driver(CRTPDriver):  # type: ignore[misc]
-    """What both kinds of link have in common."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.counters = LinkCounters()
-        self.on_silence_end: Callable[[], None] = lambda: None  # the end of a silence
-        self.on_setpoint_sent: Callable[[], None] = lambda: None  # a set-point has been sent
-
-    def limit(self, polls_hz: float) -> None:
-        """From now on send at most so many packets a second."""
-
-    def _acknowledge(self, now: float) -> None:
-        silent, self.counters.acknowledged = now - self.counters.acknowledged > DEAF_S, now
-        if silent:
-            self.on_silence_end()
-
-
-class RadioDriver(_Driver):
+class RadioDriver(CRTPDriver):  # type: ignore[misc]
     """One Crazyflie's link over a dongle. `due`, `exchange` and what they call belong to the dongle's thread."""
 
     def __init__(self, radios: DongleSet) -> None:
         super().__init__()
-        self._radios, self.mailbox = radios, Mailbox()
-        self._arrived: queue.Queue[Any] = queue.Queue()
+        self.quality, self.rssi = 1.0, 0  # 0 to 1, and -dBm
+        self.on_acknowledged: Callable[[], None] = lambda: None  # anything has been acknowledged
+        self.on_setpoint_sent: Callable[[], None] = lambda: None  # a set-point has been acknowledged
+        self.mailbox = Mailbox()
+        self._radios = radios
         self._dongle: DongleThread | None = None
+        self._arrived: queue.Queue[Any] = queue.Queue()
         self._pending: tuple[str, bytes] | None = None  # sent, and not acknowledged
         self._tries, self._safelink, self._up, self._down = 0, False, 0, 0
         self._last = self._least_s = 0.0  # s: when a packet last went (monotonic), and shortest time between two
+        self._acknowledged = -math.inf  # s, monotonic
         self._empty_polls, self._established = 0, False
         self._scores: deque[int] = deque(maxlen=100)  # 10 less the repetitions of each packet
 
@@ -171,11 +147,11 @@ class RadioDriver(_Driver):
         limit = uri.partition("rate_limit=")[2].partition("&")[0]
         if limit.isdigit() and int(limit):
             self.limit(float(limit))
-        dongle = self._radios.dongle(self.address)
-        dongle.add(self)
-        self._dongle = dongle
+        self._dongle = self._radios.dongle(self.address)
+        self._dongle.add(self)
 
     def limit(self, polls_hz: float) -> None:
+        """From now on send at most so many packets a second."""
         self._least_s = 1.0 / polls_hz
 
     def send_packet(self, pk: Any) -> bool:
@@ -197,14 +173,10 @@ class RadioDriver(_Driver):
 
     def due(self, now: float) -> float:
         """Return when the next packet goes (s, monotonic)."""
-        pause = self._least_s
-        if (
-            now - self.counters.acknowledged > ABSENT_S
-            and self._tries >= SAFELINK_TRIES
-            and not self.mailbox.has_commands
-        ):
+        pause, absent = self._least_s, now - self._acknowledged > ABSENT_S and self._tries >= SAFELINK_TRIES
+        if absent and not self.mailbox.commands:
             pause = max(pause, ABSENT_POLL_S)
-        elif self._pending is None and self.mailbox.is_empty and self._empty_polls > BUSY_POLLS:
+        elif self._pending is None and not self.mailbox and self._empty_polls > BUSY_POLLS:
             pause = max(pause, RELAXED_S)
         return self._last + pause
 
@@ -234,10 +206,10 @@ class RadioDriver(_Driver):
         box, pending, both = self.mailbox, self._pending, False
         if pending is None:
             pending = box.pop() or (EMPTY, NULL)
-        elif now - self.counters.acknowledged > DEAF_S:
+        elif now - self._acknowledged > DEAF_S:
             if (command := box.pop(COMMAND)) is not None:
-                if pending[0] == REQUEST:
-                    box.return_request(pending[1])
+                if pending[0] == REQUEST:  # it may not have arrived
+                    box.requests.appendleft(pending[1])
                 pending, both = command, True
             elif pending[0] in (SETPOINT, POSITION):
                 pending = EMPTY, NULL  # too old
@@ -248,7 +220,7 @@ class RadioDriver(_Driver):
 
     def _answered(self, data: bytes, repeated: int, greeting: bool) -> None:
         self._scores.append(10 - repeated)
-        self.counters.quality = sum(self._scores) / len(self._scores) / 10
+        self.quality = sum(self._scores) / len(self._scores) / 10
         kind, fresh = EMPTY, bool(data)
         if greeting:
             self._safelink, fresh = data == SAFELINK, False
@@ -258,16 +230,16 @@ class RadioDriver(_Driver):
             if self._safelink:
                 fresh = fresh and data[0] & DOWN_BIT == self._down * DOWN_BIT
                 self._up, self._down = 1 - self._up, 1 - self._down if fresh else self._down
-        self.counters.sent += kind != EMPTY
         if kind == SETPOINT:
             self.on_setpoint_sent()
-        self._acknowledge(time.monotonic())
+        self._acknowledged = time.monotonic()
+        self.on_acknowledged()
         if not fresh:
             return
         nothing = data[0] & HEADER == HEADER
         self._empty_polls = self._empty_polls + (kind == EMPTY) if nothing else 0
         if nothing and data[1:2] == b"\x01" and len(data) > 2:
-            self.counters.rssi = data[2]
+            self.rssi = data[2]
         if not nothing or not self._established:  # cflib wants one packet, whatever it is, to begin
             self._established = True
             self._arrived.put(CRTPPacket(data[0], list(data[1:])))
@@ -286,11 +258,10 @@ class DongleThread(threading.Thread):
         self.foreign = False  # another radio sends on the channel, as it seems
         self._condition = threading.Condition()
         self._links: list[RadioDriver] = []
-        self._stops: deque[tuple[int, int]] = deque()  # channel and data rate of packets that stop all
+        self._stops: deque[tuple[float, int, int]] = deque()  # when (s, monotonic), channel, rate of a stop of all
         self._closing = False
-        self._late = 0
+        self._late, self._serial = 0, ""
         self._repeated: deque[bool] = deque()
-        self._serial = ""
         self._device: Any = self._open()
         self.start()
 
@@ -316,7 +287,7 @@ class DongleThread(threading.Thread):
     def remove(self, link: RadioDriver) -> None:
         """Serve a link no more, once its commands are sent or have waited for long enough."""
         end = time.monotonic() + CLOSE_S
-        while self._device is not None and link.mailbox.has_commands and time.monotonic() < end:
+        while self._device is not None and link.mailbox.commands and time.monotonic() < end:
             time.sleep(0.005)
         with self._condition:
             self._links.remove(link)
@@ -328,8 +299,9 @@ class DongleThread(threading.Thread):
             self._condition.notify()
 
     def stop_channel(self, channel: int, rate: int) -> None:
-        """Stop all Crazyflies on a channel; does not wait."""
-        self._stops.append((channel, rate))
+        """Stop all Crazyflies on a channel, again and again; does not wait."""
+        now = time.monotonic()
+        self._stops.extend((now + k * PAUSE_S, channel, rate) for k in range(ROUNDS))
         self.wake()
 
     def close(self) -> None:
@@ -343,19 +315,23 @@ class DongleThread(threading.Thread):
         turn = 0
         while not self._closing or self._stops:
             if self._device is None and not self._find():
+                if self._closing:
+                    return
                 time.sleep(REOPEN_S)
                 continue
             with self._condition:
                 now, links = time.monotonic(), self._links[turn:] + self._links[:turn]
                 due = [link.due(now) for link in links]
                 ready = next((link for link, when in zip(links, due, strict=True) if when <= now), None)
-                if ready is None and not self._stops and not self._closing:
+                stop = self._stops.popleft() if self._stops and self._stops[0][0] <= now else None
+                if ready is None and stop is None and (self._stops or not self._closing):
+                    due += [when for when, _, _ in self._stops]
                     self._condition.wait(max(0.0, min(due) - now) if due else None)
                     continue
                 turn = (self._links.index(ready) + 1) % len(self._links) if ready is not None else 0
             try:
-                if self._stops:
-                    self._send_stops(*self._stops.popleft())
+                if stop is not None:
+                    self._send_stop(*stop[1:])
                 if ready is not None:
                     self._serve(ready)
             except Exception as error:  # USB's errors have no common base
@@ -377,7 +353,7 @@ class DongleThread(threading.Thread):
                 text = f"{share:.0%} of the packets on channel {link.address.channel} are repeated"
                 self._report("warn", f"radio {self.radio}: {text}: does another transmitter use its channel?")
 
-    def _send_stops(self, channel: int, rate: int) -> None:
+    def _send_stop(self, channel: int, rate: int) -> None:
         self._device.set_channel(channel)
         self._device.set_data_rate(rate)
         self._device.set_address(BROADCAST)
@@ -389,85 +365,70 @@ class DongleThread(threading.Thread):
     def _lose(self, why: str) -> None:
         links = {link.address.link for link in self._links}
         served = ", ".join(name for link, name in self._names.items() if link in links)  # in the file's order
-        self._report(
-            "error", f"radio {self.radio} ({self._serial}) is gone ({why}): {served or 'no vehicle'} out of reach"
-        )
+        gone = f"radio {self.radio} ({self._serial}) is gone ({why})"
+        self._report("error", f"{gone}: {served or 'no vehicle'} out of reach")
         device, self._device = self._device, None
         with contextlib.suppress(Exception):
             device.close()
 
     def _find(self) -> bool:
         with contextlib.suppress(Exception):  # not there yet
-            self._device = self._open()
-            self._late = 0
+            self._device, self._late = self._open(), 0
             self._report("info", f"radio {self.radio} ({self._serial}) is there again")
-        return self._device is not None or self._closing
+        return self._device is not None
 
 
-class UdpDriver(_Driver):
+class UdpDriver(CRTPDriver):  # type: ignore[misc]
     """A link over UDP, for simulated Crazyflies. It ends by errors only before something was heard over it."""
-
-    _socket: socket.socket | None = None
-    _error: Callable[[str], None] | None = None
 
     def connect(self, uri: str, statistics: Any, error: Callable[[str], None] | None) -> None:
         """Open the link."""
         if not uri.startswith("udp://"):
             raise WrongUriType("not UDP")
         address = parse_address(uri)
-        self.needs_resending, self._error = False, error
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.needs_resending, self._error, self._heard = False, error, False
+        self._socket: Any = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((address.host, address.port))
 
     def send_packet(self, pk: Any) -> bool:
-        sock, data = self._socket, bytes((pk.header,)) + bytes(pk.data)
-        if sock is None or data[0] & 0xF0 == LEGACY_SETPOINT:
-            return True
-        try:
+        for last in (False, True) if pk.header & 0xF0 != LEGACY_SETPOINT else ():
             try:
-                sock.send(data)
-            except ConnectionRefusedError:  # the answer to an earlier packet; this one was not sent
-                sock.send(data)
-        except OSError as problem:
-            self._fail(str(problem))
-            return True
-        self.counters.sent += 1
-        if kind_of(data) == SETPOINT:
-            self.on_setpoint_sent()
+                self._socket.send(bytes((pk.header,)) + bytes(pk.data))
+                break
+            except OSError as problem:  # perhaps the answer to an earlier packet: this one was not sent
+                if last:
+                    self._fail(problem)
         return True
 
     def receive_packet(self, wait: float = 0) -> Any:
-        if (sock := self._socket) is None:
-            return None
         try:
-            sock.settimeout(None if wait < 0 else wait)
-            data = sock.recv(64)
+            self._socket.settimeout(None if wait < 0 else wait)
+            data = self._socket.recv(64)
         except (TimeoutError, BlockingIOError):
             return None
         except OSError as problem:  # a closed port: it may be opened again
-            self._fail(str(problem))
+            self._fail(problem)
             time.sleep(0.005)
             return None
-        if not data:
-            return None
-        self._acknowledge(time.monotonic())
-        return CRTPPacket(data[0], list(data[1:]))
+        self._heard |= bool(data)
+        return CRTPPacket(data[0], list(data[1:])) if data else None
 
-    def _fail(self, problem: str) -> None:
+    def _fail(self, problem: OSError) -> None:
         error, self._error = self._error, None
-        if error is not None and self._socket is not None and self.counters.acknowledged == float("-inf"):
-            error(problem)
+        if error is not None and not self._heard:
+            error(str(problem))
 
     def close(self) -> None:
-        sock, self._socket = self._socket, None
-        if sock is not None:
-            with contextlib.suppress(OSError):
-                sock.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for a packet
-            sock.close()
+        self._error = None
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for a packet
+        self._socket.close()
 
 
 class DongleSet:
     """The dongles of one bridge; cflib opens links by the drivers above until it is closed.
+
+    The first dongle that no link uses is kept for emergency stops.
 
     :param robots: names and addresses.
     :param report: called with a level and a line about dongles that come and go.
@@ -481,8 +442,8 @@ class DongleSet:
         self._dongles: dict[str, DongleThread] = {}
         self._lock = threading.Lock()
         self._drivers: list[Any] = [partial(RadioDriver, self), UdpDriver]
-        self.spare: DongleThread | None = None  # that no link uses: emergency stops go by it
         cflib.crtp.CLASSES[:0] = self._drivers
+        self.spare = self._open_spare() if self._addresses else None
 
     def dongle(self, address: Address) -> DongleThread:
         """Return the dongle of an address; raises an error if it is not there."""
@@ -501,22 +462,20 @@ class DongleSet:
         free = [str(n) for n in range(len(get_serials())) if str(n) not in named.values()] or ["0"]
         return named.get(address.channel) or free[channels.index(address.channel) % len(free)]
 
-    def keep_spare(self) -> None:
-        """Keep the first dongle that no link uses for emergency stops."""
-        if not self._addresses:
-            return
+    def _open_spare(self) -> DongleThread | None:
         used = {self._radio(address) for address in self._addresses}
         for number, serial in enumerate(get_serials()):
             if used & {str(number), serial}:
                 continue
             try:
-                self.spare = DongleThread(str(number), self._report, self._names)
+                spare = DongleThread(str(number), self._report, self._names)
             except Exception as error:  # in use by another program, or no right to use it
                 self._report("warn", f"radio {number} cannot be used for emergency stops: {error}")
-                continue
-            self._report("info", f"radio {number} is kept for emergency stops")
-            return
+            else:
+                self._report("info", f"radio {number} is kept for emergency stops")
+                return spare
         self._report("warn", "no radio is left for emergency stops: they go by the radios of the links")
+        return None
 
     @property
     def foreign(self) -> list[str]:
@@ -525,19 +484,10 @@ class DongleSet:
 
     def stop_all(self) -> None:
         """Stop all Crazyflies on the swarm's channels, by broadcast, again and again; does not wait."""
-        jobs = []
         for address in {(a.radio, a.channel, a.rate): a for a in self._addresses}.values():
             with contextlib.suppress(Exception):  # a dongle that is not there must not keep the others from it
                 dongle = self.spare or self.dongle(address)
-                jobs.append(partial(dongle.stop_channel, address.channel, tuple(BITRATES).index(address.rate)))
-
-        def send() -> None:
-            for _ in range(ROUNDS if jobs else 0):
-                for job in jobs:
-                    job()
-                time.sleep(PAUSE_S)
-
-        threading.Thread(target=send, name="emergency-stop", daemon=True).start()
+                dongle.stop_channel(address.channel, tuple(BITRATES).index(address.rate))
 
     def close(self) -> None:
         """Close all dongles, and leave cflib as it was."""

@@ -22,7 +22,7 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 
-from .addresses import LinkCounters, LinkError
+from .addresses import LinkError
 from .commands import Setpoint
 from .onboard import START, OnboardSetup, send_order
 from .positions import SettlingCheck
@@ -41,6 +41,7 @@ PLACE = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")
 INITIAL = ("kalman.initialX", "kalman.initialY", "kalman.initialZ")
 VARIANCE_MS = 50
 RESET_S = 0.1  # the firmware's tasks have seen the parameter by then
+INTEGERS = "bBhHiIqQ"  # formats of `struct`
 
 Send = Callable[[Any], None]  # gives an order to cflib's `Crazyflie`
 
@@ -66,10 +67,9 @@ def require_cflib() -> None:
 
 
 class LogClock:
-    """How old the values of a log packet are.
+    """How old the values of a log packet are: after a gap the Crazyflie delivers what it logged meanwhile.
 
-    After a gap the Crazyflie delivers what it logged meanwhile: packets that come are not always new. Their time stamps
-    tell, as the smallest delay that was ever seen is that of a packet without a wait. Times (`now`) are s, monotonic.
+    The smallest delay that was ever seen is that of a packet without a wait. Times (`now`) are s, monotonic.
     """
 
     MAX_DRIFT = 1e-4  # of the Crazyflie's clock against ours, at most
@@ -90,19 +90,6 @@ class LogClock:
         return min(now, stamp_ms / 1000 + self._offset)
 
 
-class ConnectionAttempt:
-    """How far a connection has come, as cflib's threads say."""
-
-    def __init__(self) -> None:
-        self.settled = threading.Event()  # it is connected, or that has failed
-        self.failure = ""  # why it has failed; empty: it has not
-
-    def fail(self, reason: str) -> None:
-        """It has failed."""
-        self.failure = self.failure or reason
-        self.settled.set()
-
-
 class CrazyflieLink:
     """One Crazyflie's connection and log.
 
@@ -110,36 +97,31 @@ class CrazyflieLink:
     :param on_state: called with each decoded log packet and when it was logged (s, monotonic), in a thread of cflib's.
     :param on_broken: called with a reason when the connection ends by itself, in a thread of cflib's.
     :param on_answer: called with the first byte of a high-level order and the firmware's answer, in such a thread.
+    :param settling: makes what decides when the estimator has settled.
     :param measured_place: where motion capture sees the Crazyflie (m, world); None: not at all.
     """
 
     def __init__(
-        self,
-        robot: RobotSettings,
-        cache: Path,
-        on_state: Callable[[VehicleState, float], None],
-        on_broken: Callable[[str], None],
-        on_answer: Callable[[int, int], None],
-        settling: SettlingCheck,
-        measured_place: Callable[[], Vector | None],
-    ) -> None:
+        self, robot: RobotSettings, cache: Path, on_state: Callable[[VehicleState, float], None],
+        on_broken: Callable[[str], None], on_answer: Callable[[int, int], None],
+        settling: Callable[[], SettlingCheck], measured_place: Callable[[], Vector | None],
+    ) -> None:  # fmt: skip
         self.robot = robot
         self.connected = False
-        self.received = 0  # log packets
-        self.counters = LinkCounters()
+        self.sent = self.received = 0  # packets, and log packets
+        self.acknowledged = -math.inf  # s, monotonic: when anything last came, or was acknowledged
         self.firmware: tuple[int, str] | None = None  # version of its protocol, and revision; None: never connected
         self.board: OnboardSetup | None = None  # what the app on board is told; None: there is none
         self.guarded = False  # the firmware's emergency watchdog wants to be fed as soon as it can be
-        self.latencies: deque[float] = deque(maxlen=500)  # s, from the arrival of a command to its packet
-        self.send_times: deque[float] = deque(maxlen=200)  # s, monotonic, of the last streamed commands
+        self.setpoints: deque[tuple[float, float]] = deque(maxlen=500)  # when sent (s, monotonic), s since it came
         self._cache, self._settling, self._measured_place = cache, settling, measured_place
         self._on_state, self._on_broken, self._on_answer = on_state, on_broken, on_answer
         self._closed = False
         self._cf: Any = None
-        self._driver: Any = None  # ours; None: one of cflib's own
-        self._attempt = ConnectionAttempt()
+        self.driver: Any = None  # over a radio ours, which knows its quality (0 to 1) and rssi (-dBm)
+        self._settled, self._failure = threading.Event(), ""  # of the present attempt to connect
         self._stamp = 0.0  # s, monotonic, of the last streamed command
-        self._log_clock = LogClock()
+        self._log_clock, self._logged = LogClock(), threading.Event()
         self._audible_since = self._log_ordered = -math.inf  # s, monotonic
         self._log_order_s = LOG_ORDER_S
         self._log_block: Any = None
@@ -155,19 +137,25 @@ class CrazyflieLink:
         if (cf := self.crazyflie) is not None:
             self._stamp = setpoint.stamp
             getattr(cf.commander, f"send_{setpoint.kind}_setpoint")(*setpoint.arguments)
-            if self._driver is None:
+            if self.driver is None:
                 self._count_setpoint()
 
     def _count_setpoint(self) -> None:
-        """A set-point has been sent."""
         now = time.monotonic()
-        self.latencies.append(now - self._stamp)
-        self.send_times.append(now)
+        self.setpoints.append((now, now - self._stamp))
 
-    def order(self, action: Send) -> None:
+    def order(self, action: Send, cf: Any = None) -> None:
         """Give an order, if there is a connection. Emergency stops go before everything that waits."""
-        if (cf := self.crazyflie) is not None:
-            self._give(cf, action)
+        if (cf := cf or self.crazyflie) is not None:
+            try:
+                action(cf)
+            except Exception as error:  # cflib's, of a link that has just ended
+                self._on_broken(f"could not send: {error}")
+
+    def send_position(self, send: Send) -> None:
+        """Send where motion capture sees it, while it connects, too: the estimator settles by that."""
+        if (cf := self._cf) is not None and cf.is_connected():
+            self.order(send, cf)
 
     @property
     def can_set(self) -> bool:
@@ -181,21 +169,19 @@ class CrazyflieLink:
             with contextlib.suppress(KeyError, AttributeError):  # the link has just ended
                 self._cf.param.set_value(name, value)
 
-    def send_position(self, send: Send) -> None:
-        """Send where motion capture sees it, while it connects, too: the estimator settles by that."""
-        if (cf := self._cf) is not None and cf.is_connected():
-            self._give(cf, send)
-
-    def _give(self, cf: Any, action: Send) -> None:
-        try:
-            action(cf)
-        except Exception as error:  # cflib's, of a link that has just ended
-            self._on_broken(f"could not send: {error}")
-
-    # -- what is known of it ----------------------------------------------------------------------------------------
-    def silence(self, now: float) -> float:
-        """Seconds since something was acknowledged, or came; infinite before that."""
-        return now - self.counters.acknowledged
+    def parameters(self) -> dict[str, tuple[Any, float]]:
+        """Return the firmware's parameters by `group.name`: cflib's entry in its table, and the value as last read."""
+        found: dict[str, tuple[Any, float]] = {}
+        if (cf := self.crazyflie) is None:
+            return found
+        param = cf.param
+        for group, values in param.values.copy().items():
+            for name, text in values.copy().items():
+                element, full_name = param.toc.toc[group][name], f"{group}.{name}"
+                read = int(text) if element.pytype[-1] in INTEGERS else float(text)
+                # A value that was set after connecting is newer than cflib's copy.
+                found[full_name] = element, self.robot.firmware_params.get(full_name, read)
+        return found
 
     # -- connection -------------------------------------------------------------------------------------------------
     def connect(self) -> str:
@@ -225,18 +211,19 @@ class CrazyflieLink:
         self._drop()
         limit = self.robot.connect_timeout_s
         deadline = time.monotonic() + limit
-        cf = Crazyflie(rw_cache=str(self._cache))
-        attempt = self._watch(cf)
-        self._cf = cf
+        cf = self._cf = Crazyflie(rw_cache=str(self._cache))
+        self._watch(cf)
         cf.open_link(self.robot.uri)
-        self._watch_driver(cf.link)
-        settled = attempt.settled.wait(min(FIRST_ANSWER_S, limit))
-        if self.robot.address.radio and not settled and self.silence(time.monotonic()) == math.inf:
+        if hasattr(cf.link, "on_acknowledged"):  # one of our drivers
+            self.driver = cf.link
+            cf.link.on_acknowledged, cf.link.on_setpoint_sent = self._acknowledge, self._count_setpoint
+        settled = self._settled.wait(min(FIRST_ANSWER_S, limit))
+        if self.robot.address.radio and not settled and self.acknowledged == -math.inf:
             raise LinkError(f"no answer on the air within {FIRST_ANSWER_S:g} s")
-        if not attempt.settled.wait(max(0.0, deadline - time.monotonic())):
+        if not self._settled.wait(max(0.0, deadline - time.monotonic())):
             raise LinkError(f"no answer within {limit:g} s")
-        if attempt.failure:
-            raise LinkError(attempt.failure)
+        if self._failure:
+            raise LinkError(self._failure)
         if self.robot.address.radio:
             cf.link_statistics.stop()  # its pings take air; elsewhere they tell that the Crazyflie is there
         for name, value in self.robot.firmware_params.items():
@@ -248,50 +235,58 @@ class CrazyflieLink:
             self.board.prepare(cf)
         if self.robot.reset_estimator:
             self._reset_estimator(cf)
-        self.firmware = _firmware(cf)
-        self._start_log(cf, max(deadline, time.monotonic() + 2.0))
+        known = {"modified": 0} | cf.param.values.get("firmware", {})
+        revision = f"{int(known['revision0']):08x}" if "revision0" in known else "unknown"
+        modified = " modified" if int(known["modified"]) else ""
+        self.firmware = int(cf.platform.get_protocol_version()), revision + modified
+        self._logged.clear()
+        self._begin_log(cf)
+        if not self._logged.wait(max(2.0, deadline - time.monotonic())):
+            raise LinkError("no log packets")
         self.connected = True
 
-    def _watch(self, cf: Any) -> ConnectionAttempt:
+    def _watch(self, cf: Any) -> None:
         """Take note of all that cflib says about a connection, from its threads."""
         from cflib.crtp.crtpstack import CRTPPort
 
-        attempt = self._attempt = ConnectionAttempt()
+        self._settled.clear()
+        self._failure = ""
 
         def broken(uri: str, message: str) -> None:
+            if self._cf is not cf:
+                return  # of an earlier attempt
             reason = message.partition("\n\n")[0].replace("\n", " ")
-            attempt.fail(reason)
-            if self._cf is cf and self.connected:
+            self._failure = self._failure or reason
+            self._settled.set()
+            if self.connected:
                 self.connected = False
                 self._on_broken(f"link broken: {reason}")
 
+        def sent(packet: Any) -> None:
+            self.sent += 1
+
         def received(packet: Any) -> None:
-            if self._driver is None:
-                self.counters.acknowledged = time.monotonic()
+            if self.driver is None:
+                self._acknowledge()
 
         def answered(packet: Any) -> None:
             if len(packet.data) > 3:
                 self._on_answer(packet.data[0], packet.data[3])
 
-        cf.fully_connected.add_callback(lambda uri: attempt.settled.set())
+        cf.fully_connected.add_callback(lambda uri: self._settled.set())
         cf.connection_failed.add_callback(broken)
         cf.connection_lost.add_callback(broken)
+        cf.packet_sent.add_callback(sent)
         cf.packet_received.add_callback(received)
         cf.add_port_callback(CRTPPort.SETPOINT_HL, answered)
-        return attempt
 
-    def _watch_driver(self, driver: Any) -> None:
-        if hasattr(driver, "counters"):
-            self._driver = driver
-            driver.counters.sent += self.counters.sent
-            self.counters = driver.counters
-            driver.on_silence_end, driver.on_setpoint_sent = self._end_silence, self._count_setpoint
-
-    def _end_silence(self) -> None:
-        """The end of a silence: the firmware's watchdog has not much time left."""
-        self._audible_since = time.monotonic()
-        if self.guarded:
-            self.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
+    def _acknowledge(self) -> None:
+        """Something came, or was acknowledged; at the end of a silence the firmware's watchdog has little time left."""
+        silent, self.acknowledged = time.monotonic() - self.acknowledged > AUDIBLE_S, time.monotonic()
+        if silent:
+            self._audible_since = self.acknowledged
+            if self.guarded:
+                self.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
 
     def _reset_estimator(self, cf: Any) -> None:
         """Restart the Kalman filter, and wait until it knows where it stands; positions are sent meanwhile.
@@ -300,12 +295,14 @@ class CrazyflieLink:
         """
         from cflib.crazyflie.log import LogConfig
 
-        settled, timeout = threading.Event(), self.robot.estimator_timeout_s
+        check, settled, timeout = self._settling(), threading.Event(), self.robot.estimator_timeout_s
+        problem = "the firmware logs nothing about it"
 
         def sample(stamp: int, values: dict[str, float], block: Any) -> None:
+            nonlocal problem
             x, y, z = (values[name] for name in PLACE)
-            vx, vy, vz = (values[name] for name in VARIANCES)
-            if self._settling.add_sample((x, y, z), (vx, vy, vz), self._measured_place()):
+            problem = check.find_problem((x, y, z), max(values[name] for name in VARIANCES), self._measured_place())
+            if not problem:
                 settled.set()
 
         if (place := self._measured_place()) is not None:  # the filter begins where it is seen, not metres away
@@ -314,7 +311,6 @@ class CrazyflieLink:
         cf.param.set_value("kalman.resetEstimation", 1)
         time.sleep(RESET_S)
         cf.param.set_value("kalman.resetEstimation", 0)
-        self._settling.restart()
         block = LogConfig("variance", VARIANCE_MS)
         for name in (*VARIANCES, *PLACE):
             block.add_variable(name, "float")
@@ -327,7 +323,7 @@ class CrazyflieLink:
         settled.wait(timeout)
         block.delete()
         if not settled.is_set():
-            raise LinkError(f"the estimator did not settle within {timeout:g} s: {self._settling.problem}")
+            raise LinkError(f"the estimator did not settle within {timeout:g} s: {problem}")
 
     def start_agent(self) -> str:
         """Start the agent on board, in the calling thread; why it does not start, or an empty text.
@@ -341,21 +337,14 @@ class CrazyflieLink:
             send_order(cf, START)
         except LinkError as error:
             return str(error)
-        if self._driver is not None:
-            self._driver.limit(board.polls_hz)
+        if self.driver is not None:
+            self.driver.limit(board.polls_hz)
             # An order takes some packets of each way, and the log comes seldom.
             self._log_order_s = LOG_ORDER_S + 1.0 / self.robot.log_rate_hz + 5.0 / board.polls_hz
         return ""
 
     # -- log --------------------------------------------------------------------------------------------------------
-    def _start_log(self, cf: Any, deadline: float) -> None:
-        first = threading.Event()
-        self._begin_log(cf, first.set)
-        if not first.wait(max(0.0, deadline - time.monotonic())):
-            raise LinkError("no log packets")
-
-    def _begin_log(self, cf: Any, received: Callable[[], None]) -> None:
-        """Order the log; `received` is called with each packet."""
+    def _begin_log(self, cf: Any) -> None:
         from cflib.crazyflie.log import LogConfig
 
         block = LogConfig("state", max(10, round(1000 / self.robot.log_rate_hz / 10) * 10))
@@ -365,7 +354,7 @@ class CrazyflieLink:
         def receive(stamp: int, values: dict[str, float], config: Any) -> None:
             self.received += 1
             self._on_state(decode_log(values), self._log_clock.sampled(stamp, time.monotonic()))
-            received()
+            self._logged.set()
 
         block.data_received_cb.add_callback(receive)
         try:
@@ -378,7 +367,7 @@ class CrazyflieLink:
     def order_log(self, now: float) -> None:
         """Order the log anew, if it can be heard now (s, monotonic): the firmware ends it in a gap of a second."""
         last = max(self._log_clock.last, self._audible_since, self._log_ordered)
-        if self.silence(now) > AUDIBLE_S or now - last < self._log_order_s:
+        if now - self.acknowledged > AUDIBLE_S or now - last < self._log_order_s:
             return
         self._log_ordered = now
 
@@ -386,7 +375,7 @@ class CrazyflieLink:
             self._log_block.delete()
             with contextlib.suppress(ValueError):
                 cf.log.log_blocks.remove(self._log_block)
-            self._begin_log(cf, lambda: None)
+            self._begin_log(cf)
 
         self.order(order)
 
@@ -397,20 +386,10 @@ class CrazyflieLink:
         if cf is not None:
             with contextlib.suppress(Exception):  # whatever state it is in, we are done with it
                 cf.close_link()
-        self._driver, self.counters = None, LinkCounters(sent=self.counters.sent)
+        self.driver, self.acknowledged = None, -math.inf
 
     def close(self) -> None:
         """Close the connection. Never in flight."""
-        self._closed = True
-        self._attempt.fail("the link has been closed")
+        self._closed, self._failure = True, "the link has been closed"
+        self._settled.set()
         self._drop()
-
-
-def _firmware(cf: Any) -> tuple[int, str]:
-    """Version of the protocol and revision of the firmware."""
-    try:
-        revision = f"{int(cf.param.get_value('firmware.revision0')):08x}"
-        modified = int(cf.param.get_value("firmware.modified"))
-    except (KeyError, AttributeError, TypeError, ValueError):
-        return int(cf.platform.get_protocol_version()), "unknown"
-    return int(cf.platform.get_protocol_version()), revision + (" modified" if modified else "")

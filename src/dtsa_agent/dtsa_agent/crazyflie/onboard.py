@@ -5,9 +5,11 @@ The app is in `dtsa_agent/onboard`; docs/how-to/on-board.md explains its paramet
 
 from __future__ import annotations
 
+import queue
 import struct
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,28 +125,24 @@ def app_orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list
     return packets
 
 
+@dataclass(frozen=True, slots=True)
 class OnboardSetup:
-    """Set-up of one Crazyflie's app on the ground.
+    """Set-up of one Crazyflie's app on the ground."""
 
-    :param parameters: of the app, by `group.name`.
-    :param orders: packets of the app channel, sent in this order.
-    :param polls_hz: Hz, how often the Crazyflie is polled once its agent has started.
-    """
-
-    def __init__(self, parameters: Mapping[str, float], orders: Sequence[bytes], polls_hz: float) -> None:
-        self._parameters, self._orders = dict(parameters), tuple(orders)
-        self.polls_hz = polls_hz
+    parameters: Mapping[str, float]  # of the app, by `group.name`
+    orders: Sequence[bytes]  # packets of the app channel, sent in this order
+    polls_hz: float  # Hz, how often the Crazyflie is polled once its agent has started
 
     def prepare(self, cf: Any) -> None:
         """Send parameters and orders to the app; LinkError: the Crazyflie has no such app, or the app refuses."""
-        unconfirmed, all_confirmed = set(self._parameters), threading.Event()
+        unconfirmed, all_confirmed = set(self.parameters), threading.Event()
 
         def confirm(name: str, value: str) -> None:
             unconfirmed.discard(name)
             if not unconfirmed:
                 all_confirmed.set()
 
-        for name, value in self._parameters.items():
+        for name, value in self.parameters.items():
             cf.param.add_update_callback(*name.split("."), cb=confirm)
             try:
                 cf.param.set_value(name, value)
@@ -152,33 +150,31 @@ class OnboardSetup:
                 raise LinkError(f"parameter {name} of the app on board: {error}") from error
         if not all_confirmed.wait(_CONFIRM_TIMEOUT_S):
             raise LinkError(f"not confirmed: {', '.join(sorted(unconfirmed))}")
-        for name in self._parameters:
+        for name in self.parameters:
             cf.param.remove_update_callback(*name.split("."), cb=confirm)
-        for order in self._orders:
+        for order in self.orders:
             send_order(cf, order)
 
 
 def send_order(cf: Any, order: bytes) -> None:
     """Send an order to the app on board, and wait for its answer; LinkError: no answer, or the app refuses."""
-    answers: list[bytes] = []
-    answered = threading.Event()
+    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def receive(data: Any) -> None:
         if bytes(data)[:1] == order[:1]:
-            answers.append(bytes(data))
-            answered.set()
+            answers.put(bytes(data))
 
     cf.appchannel.packet_received.add_callback(receive)
     try:
         for _ in range(_ATTEMPTS):
             cf.appchannel.send_packet(order)
-            if answered.wait(_ANSWER_TIMEOUT_S):
+            with suppress(queue.Empty):
+                answer = answers.get(timeout=_ANSWER_TIMEOUT_S)
                 break
+        else:
+            raise LinkError(f"the app on board does not answer order {order[:1].decode()}")
     finally:
         cf.appchannel.packet_received.remove_callback(receive)
-    if not answers:
-        raise LinkError(f"the app on board does not answer order {order[:1].decode()}")
-    if answers[0][1:2] != b"\x01":
-        raise LinkError(
-            f"the app on board refuses order {order[:1].decode()}: {answers[0][2:].decode(errors='replace')}"
-        )
+    if answer[1:2] != b"\x01":
+        why = answer[2:].decode(errors="replace")
+        raise LinkError(f"the app on board refuses order {order[:1].decode()}: {why}")

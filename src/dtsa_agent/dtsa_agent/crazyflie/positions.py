@@ -1,14 +1,16 @@
-"""Poses of one Crazyflie from motion capture: plausibility checks, and agreement with the onboard estimate. No I/O.
+"""Poses of one Crazyflie from motion capture: plausibility checks, and agreement with the onboard estimate.
 
-Poses, stamps and clocks come in as arguments. A refused pose is counted by its cause and never sent.
+A refused pose is counted by its cause and never sent.
 Times (`now`) are s, monotonic; stamps are s, Unix time, 0: not known.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from typing import Any
 
 from dtsa_agent.core.settings.declaration import Settings, setting
 
@@ -78,14 +80,7 @@ class MeasuredPose:
 
 
 class RefusedPose(Exception):
-    """A pose fails a check.
-
-    :param cause: one or two words, by which refusals are counted.
-    """
-
-    def __init__(self, cause: str, reason: str) -> None:
-        super().__init__(reason)
-        self.cause = cause
+    """A pose fails a check; its arguments are the cause, by which refusals are counted, and the reason."""
 
 
 @dataclass(slots=True)
@@ -118,17 +113,16 @@ class PoseTracker:
         """
         try:
             pose = self._check_alone(position, orientation, frame, stamp, now, flying=flying)
-            if self.last is not None:
-                try:
-                    self._check_follows(self.last, pose, flying=flying)
-                except RefusedPose:
-                    confirmed = self._confirm_jump(pose)
-                    if flying or not confirmed:
-                        raise
-                    self._min_delay = math.inf  # perhaps the clock was set
+            try:
+                self._check_follows(pose, flying=flying)
+            except RefusedPose:
+                confirmed = self._confirm_jump(pose)
+                if flying or not confirmed:
+                    raise
+                self._min_delay = math.inf  # perhaps the clock was set
         except RefusedPose as problem:
-            self.refused[problem.cause] += 1
-            self.reason = str(problem)
+            cause, self.reason = problem.args
+            self.refused[cause] += 1
             return self.reason
         if stamp:
             waited = 0.0 if self.last is None else now - self.last.time
@@ -143,14 +137,14 @@ class PoseTracker:
         """Check what a pose says by itself: frame, room, attitude; RefusedPose: it is impossible."""
         if frame not in ("", "world", "map"):
             raise RefusedPose("frame", f"frame_id {frame!r:.40} is neither world nor map")
-        if not all(math.isfinite(v) for v in (*position, *orientation)):
+        if not all(map(math.isfinite, (*position, *orientation))):
             raise RefusedPose("not finite", "the pose is not finite")
         place = to_world(position, self.origin) if frame == "map" else position
         if outside := outside_room(place, self.origin, self.room):
             raise RefusedPose("outside", outside)
-        norm = math.sqrt(sum(c * c for c in orientation))
         if self.settings.send != EXTPOSE:
             return MeasuredPose(place, None, stamp, now)
+        norm = math.hypot(*orientation)
         if abs(norm - 1.0) > NORM_TOLERANCE:
             raise RefusedPose("quaternion", f"the quaternion has length {norm:.3g}, not 1 (send: extpos needs none)")
         x, y, z, w = (c / norm for c in orientation)
@@ -159,8 +153,10 @@ class PoseTracker:
             raise RefusedPose("attitude", f"it is tilted by {math.degrees(tilt):.0f} degrees in flight")
         return MeasuredPose(place, (x, y, z, w), stamp, now)
 
-    def _check_follows(self, last: MeasuredPose, pose: MeasuredPose, *, flying: bool) -> None:
-        """Check a pose against the one before: order, delay, speed; RefusedPose: it cannot follow."""
+    def _check_follows(self, pose: MeasuredPose, *, flying: bool) -> None:
+        """Check a pose against the last one: order, delay, speed; RefusedPose: it cannot follow."""
+        if (last := self.last) is None:
+            return
         passed = pose.time - last.time
         if pose.stamp and last.stamp and pose.stamp <= last.stamp:
             raise RefusedPose("stamp", f"its stamp is {last.stamp - pose.stamp:.3f} s before that of the last one")
@@ -196,11 +192,17 @@ class PoseTracker:
         self._next_send = max(self._next_send, now - 0.9 * period) + period
         return True
 
-    def count_sent(self, pose: MeasuredPose, unix_time: float) -> None:
-        """Count a pose that was sent to its Crazyflie at a Unix time (s)."""
+    def send(self, cf: Any) -> None:
+        """Send the last accepted pose to its Crazyflie, cflib's."""
+        pose = self.last
+        assert pose is not None
+        if pose.orientation is None:
+            cf.loc.send_extpos(pose.position)
+        else:
+            cf.loc.send_extpose(pose.position, pose.orientation)
         self.sent += 1
         if pose.stamp:
-            self.latencies.append(unix_time - pose.stamp)
+            self.latencies.append(time.time() - pose.stamp)
 
     def age(self, now: float) -> float:
         """Return the time since the last accepted pose, s; infinite before the first."""
@@ -208,12 +210,7 @@ class PoseTracker:
 
     def rate_hz(self, now: float) -> float:
         """Return the number of poses accepted in the last second."""
-        return float(sum(1 for t in self._times.copy() if now - t <= 1.0))
-
-    def latency_quantile(self, share: float) -> float:
-        """Return a quantile of the latencies of the last poses, s; 0: unknown."""
-        delays = sorted(self.latencies.copy())
-        return delays[int(share * (len(delays) - 1))] if delays else 0.0
+        return float(sum(now - t <= 1.0 for t in self._times.copy()))
 
     def measured_position(self, now: float) -> Vector | None:
         """Return the vehicle's measured position (m, world); None if there is no fresh pose."""
@@ -224,10 +221,15 @@ class PoseTracker:
         measured = self.measured_position(now)
         if measured is None:
             return f"is not seen by motion capture ({self.reason or 'no pose comes'})"
-        error = math.dist(measured, estimate)
-        if error <= self.settings.agree_m:
-            return ""
-        return f"is seen {error:.2f} m from where it believes to be (limit {self.settings.agree_m:g} m): reconnect it"
+        error, limit = math.dist(measured, estimate), self.settings.agree_m
+        where = f"{error:.2f} m from where it believes to be (limit {limit:g} m)"
+        return "" if error <= limit else f"is seen {where}: reconnect it"
+
+
+def quantile(values: deque[float], share: float) -> float:
+    """Return a quantile of what other threads may add to; 0: there is nothing."""
+    ordered = sorted(values.copy())
+    return ordered[int(share * (len(ordered) - 1))] if ordered else 0.0
 
 
 def outside_room(place: Vector, origin: Vector, room: Room | None) -> str:
@@ -240,10 +242,9 @@ def outside_room(place: Vector, origin: Vector, room: Room | None) -> str:
 
 @dataclass(slots=True)
 class SettlingCheck:
-    """Decides when the estimator of a Crazyflie has settled after a restart.
+    """Decides when the estimator of a Crazyflie has settled after a restart: steady, inside the room, and accurate.
 
     With motion capture, the estimate must agree with the measured position; without, its variances must be small.
-    In both cases the estimate must be steady, and inside the room.
 
     :param variance_limit: m^2.
     :param agree_m: m, largest distance from the measured position; None: there is no motion capture.
@@ -253,23 +254,13 @@ class SettlingCheck:
     origin: Vector
     room: Room | None
     agree_m: float | None
-    problem: str = "nothing is known about it"
     _places: deque[Vector] = field(default_factory=lambda: deque(maxlen=SETTLED_SAMPLES))
 
-    def restart(self) -> None:
-        """Forget all samples: the filter was restarted."""
-        self.problem = "the firmware logs nothing about it"
-        self._places.clear()
-
-    def add_sample(self, place: Vector, variances: Vector, measured: Vector | None) -> bool:
-        """Add a logged estimate (m, world), its variances (m^2) and the measured position; True once it has settled."""
+    def find_problem(self, place: Vector, variance: float, measured: Vector | None) -> str:
+        """Return why it has not settled, by one more estimate (m, world), its largest variance (m^2) and position."""
         self._places.append(place)
-        self.problem = self._find_problem(place, variances, measured)
-        return not self.problem
-
-    def _find_problem(self, place: Vector, variances: Vector, measured: Vector | None) -> str:
         where = place_text(place)
-        if not all(math.isfinite(v) for v in (*place, *variances)):
+        if not all(map(math.isfinite, (*place, variance))):
             return f"its estimate is not finite {where}"
         if self.agree_m is not None:
             if measured is None:
@@ -278,8 +269,8 @@ class SettlingCheck:
             if error > self.agree_m:
                 at = place_text(measured)
                 return f"it believes to be at {where}, motion capture sees it {error:.2f} m away at {at}"
-        elif max(variances) > self.variance_limit:
-            return f"variance {max(variances):.3g} m^2, limit {self.variance_limit:g} m^2, at {where}"
+        elif variance > self.variance_limit:
+            return f"variance {variance:.3g} m^2, limit {self.variance_limit:g} m^2, at {where}"
         if outside := outside_room(place, self.origin, self.room):
             return f"it believes to be outside: {outside}"
         spread = max(math.dist(place, p) for p in self._places)

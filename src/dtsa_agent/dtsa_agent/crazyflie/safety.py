@@ -27,9 +27,8 @@ from itertools import combinations
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 
-from .state import IN_AIR, State, Vector, VehicleState, outside_by, place_text, to_map
+from .state import IN_AIR, OFF, State, Vector, VehicleState, outside_by, place_text, to_map
 
-UNKNOWN = frozenset({State.DISCONNECTED, State.CONNECTING})
 MAY_MOVE = frozenset({State.ARMED, State.FLYING, State.LANDING, State.LOST})
 UNSEEN = "not seen by motion capture"
 ESTIMATE_HOLD_S = 1.0  # a vehicle whose estimate is wrong stands still that long, then it sinks
@@ -145,10 +144,7 @@ Demands = Iterator[tuple[Action, str]]  # what a rule wants done with a vehicle,
 
 
 class SafetyMonitor:
-    """Applies the rules again and again.
-
-    :param settings: limits.
-    """
+    """Applies the rules again and again."""
 
     def __init__(self, settings: SafetySettings) -> None:
         self.settings = settings
@@ -194,7 +190,7 @@ class SafetyMonitor:
     def _battery(self, now: float, v: WatchedVehicle) -> Demands:
         for level, limit in (("warning", v.battery_warning), ("critical", v.battery_critical)):
             key, warns = (v.name, level), level == "warning"
-            if not self.settings.battery or v.state in UNKNOWN or v.battery >= limit:
+            if not self.settings.battery or v.state in OFF or v.battery >= limit:
                 self._low_since.pop(key, None)
                 continue
             low_s = now - self._low_since.setdefault(key, now)
@@ -204,7 +200,7 @@ class SafetyMonitor:
 
     def _link(self, v: WatchedVehicle) -> Demands:
         limit = self.settings.link_age_s
-        if limit and v.state not in UNKNOWN and v.log_age > limit:
+        if limit and v.state not in OFF and v.log_age > limit:
             yield Action.LOST, f"no log packet for {v.log_age:.2f} s (limit {limit:.2f} s)"
 
     def _too_close(self, vehicles: Sequence[WatchedVehicle]) -> Iterator[tuple[str, str]]:
@@ -238,15 +234,9 @@ class EstimateWatch:
     """Notices in flight when an estimate jumps, stands still, or is not where motion capture sees the vehicle.
 
     What was wrong once stays wrong until the vehicle stands.
-
-    :param jump_m: m from one packet to the next that the velocity does not explain; 0: never.
-    :param freeze_s: s without any change; 0: never.
-    :param error_m: m from where motion capture sees it; 0: never.
     """
 
-    jump_m: float
-    freeze_s: float
-    error_m: float
+    settings: SafetySettings
     wrong: str = ""  # what is wrong; empty: nothing
     since: float = 0.0  # s, monotonic, from when on
     _last: tuple[VehicleState, float] | None = None
@@ -261,38 +251,35 @@ class EstimateWatch:
         """
         last, self._last = self._last, (state, now)
         if not flying or last is None:
-            self.wrong = ""
+            self.wrong, self._unmoved_m = "", 0.0
             self._moved = self._agreed = now
-            self._unmoved_m = 0.0
             return False
-        before = last[0]
+        before, dt = last[0], now - last[1]
         if state.position != before.position or state.position[2] < STANDING_M:
             self._moved, self._unmoved_m = now, 0.0
         else:
-            self._unmoved_m += math.hypot(*state.velocity) * (now - last[1])
+            self._unmoved_m += math.hypot(*state.velocity) * dt
             if state.velocity != before.velocity or state.orientation != before.orientation:
                 self._moved = now  # the place alone may stay the same, to the millimetre, unless its velocity is large
-        if seen is None or math.dist(seen, state.position) <= self.error_m:
+        if seen is None or math.dist(seen, state.position) <= self.settings.estimate_error_m:
             self._agreed = now
         if self.wrong:
             return False
-        self.wrong = self._what_is_wrong(state, last, now, seen)
-        self.since = now
+        self.wrong, self.since = self._what_is_wrong(state, before, dt, now, seen), now
         return bool(self.wrong)
 
     def _what_is_wrong(
-        self, state: VehicleState, last: tuple[VehicleState, float], now: float, seen: Vector | None
+        self, state: VehicleState, before: VehicleState, dt: float, now: float, seen: Vector | None
     ) -> str:
-        before, dt = last[0], now - last[1]
-        follows = [p + v * dt for p, v in zip(before.position, before.velocity, strict=True)]
-        jump = math.dist(state.position, follows)
-        if self.jump_m and jump > self.jump_m + ACCELERATION * dt:
+        limits = self.settings
+        jump = math.dist(state.position, [p + v * dt for p, v in zip(before.position, before.velocity, strict=True)])
+        if limits.estimate_jump_m and jump > limits.estimate_jump_m + ACCELERATION * dt:
             return f"the estimate jumps by {jump:.2f} m within {dt:.2f} s"
-        if self.freeze_s and now - self._moved > self.freeze_s:
+        if limits.estimate_freeze_s and now - self._moved > limits.estimate_freeze_s:
             return f"the estimate has not changed for {now - self._moved:.2f} s"
-        if self.freeze_s and self._unmoved_m > STUCK_M:
+        if limits.estimate_freeze_s and self._unmoved_m > STUCK_M:
             return f"the estimated place has not changed, though it moved by {self._unmoved_m:.2f} m by its velocity"
-        if self.error_m and seen is not None and now - self._agreed > APART_S:
+        if limits.estimate_error_m and seen is not None and now - self._agreed > APART_S:
             away = math.dist(seen, state.position)
             return f"the estimate is {away:.2f} m from where motion capture sees it"
         return ""

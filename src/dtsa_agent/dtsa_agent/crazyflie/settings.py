@@ -26,7 +26,7 @@ from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, chec
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_agent.yaml_file import read_yaml
 
-from .addresses import Address, RadioLoad, RadioUser, check_distinct, parse_address, radio_loads
+from .addresses import Address, RadioLoad, check_distinct, parse_address, radio_loads
 from .onboard import OnboardSettings, check_onboard_swarm
 from .positions import NONE, PositionSettings
 from .safety import SafetySettings
@@ -109,6 +109,9 @@ class RobotSettings(Settings):
         return parse_address(self.uri)
 
 
+ROBOT_KEYS = frozenset(spec.name for spec in settings_of(RobotSettings)) - {"name"}
+
+
 @dataclass(frozen=True, slots=True)
 class GroundStationSettings(Settings):
     """The ground station."""
@@ -160,9 +163,7 @@ class SwarmSettings:
     def loads(self) -> list[RadioLoad]:
         """Packets that each radio has to carry."""
         positions = self.station.positions.max_rate_hz if self.station.positions.enabled else 0.0
-        return radio_loads(
-            RadioUser(r.name, r.address, r.command_rate_hz + positions, r.log_rate_hz) for r in self.robots
-        )
+        return radio_loads((r.address, max(r.command_rate_hz + positions, r.log_rate_hz)) for r in self.robots)
 
     def describe(self) -> list[str]:
         """Return lines for the operator: load of each radio, and keys that have no meaning here."""
@@ -181,30 +182,31 @@ def load_swarm(path: Path) -> SwarmSettings:
 
 def parse_swarm(data: object) -> SwarmSettings:
     """Check the contents of a swarm's YAML; ConfigError: something in it is not usable."""
-    top = _check_mapping("config", data)
-    unused = [str(key) for key in top if key not in SECTIONS]
-    types = _check_mapping("robot_types", top.get("robot_types"))
-    common = _check_mapping("all", top.get("all"))
-    enabled = {}
-    for name, own in _check_mapping("robots", top.get("robots")).items():
-        values = _check_mapping(f"robots.{name}", own)
-        if values.get("enabled", common.get("enabled", True)) is not False:
-            enabled[str(name)] = values
+    top = _mapping("config", data)
+    common, unused = _mapping("all", top.get("all")), [str(key) for key in top if key not in SECTIONS]
+    robots = {str(name): _mapping(f"robots.{name}", own) for name, own in _mapping("robots", top.get("robots")).items()}
+    enabled = {n: own for n, own in robots.items() if own.get("enabled", common.get("enabled", True)) is not False}
     if not enabled:
-        raise ConfigError("robots", list(top.get("robots") or ()), "at least one robot that is enabled")
-    merged = {name: _merge_robot(name, values, types, common, unused) for name, values in enabled.items()}
-    ids = _assign_ids(merged)
-    robots = []
+        raise ConfigError("robots", list(robots), "at least one robot that is enabled")
+    types = _mapping("robot_types", top.get("robot_types"))
+    merged = {name: _merge_robot(name, own, types, common, unused) for name, own in enabled.items()}
+    _assign_ids(merged)
+    built = []
     for name, values in merged.items():
         with named(f"robots.{name}"):
-            robots.append(build(RobotSettings, values | {"name": name, "id": ids[name]}))
-    robots.sort(key=lambda robot: robot.id)
-    check_distinct([(robot.name, robot.address) for robot in robots])
+            built.append(build(RobotSettings, values | {"name": name}))
+    owners: dict[int, str] = {}
+    for robot in built:
+        if owners.setdefault(robot.id, robot.name) != robot.name:
+            raise ConfigError(f"robots.{robot.name}.id", robot.id, f"an id of its own ({owners[robot.id]} has it)")
+    built.sort(key=lambda robot: robot.id)
+    check_distinct([(robot.name, robot.address) for robot in built])
     with named("station"):
-        station = GroundStationSettings.from_dict(_without_empty(_check_mapping("station", top.get("station"))))
-    if station.min_connected > len(robots):
-        raise ConfigError("station.min_connected", station.min_connected, f"1 to {len(robots)}, the enabled robots")
-    settings = SwarmSettings(tuple(robots), station, tuple(dict.fromkeys(unused)))
+        given = _mapping("station", top.get("station"))
+        station = GroundStationSettings.from_dict({key: value for key, value in given.items() if value is not None})
+    if station.min_connected > len(built):
+        raise ConfigError("station.min_connected", station.min_connected, f"1 to {len(built)}, the enabled robots")
+    settings = SwarmSettings(tuple(built), station, tuple(dict.fromkeys(unused)))
     if (swarm := settings.swarm) is not None:
         _check_swarm(settings, swarm)
     return settings
@@ -213,7 +215,7 @@ def parse_swarm(data: object) -> SwarmSettings:
 def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
     """Check robots and station for a swarm whose agents run on board."""
     station, (x_origin, y_origin, _) = settings.station, settings.station.room_origin_in_world
-    rate = station.on_board.polls_hz
+    rate, start = station.on_board.polls_hz, make_scenario(swarm).start
     if station.positions.enabled:
         allowed = f"{NONE} with on_board: poses to the Crazyflies would take their air"
         raise ConfigError("station.positions.source", station.positions.source, allowed)
@@ -223,31 +225,24 @@ def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
     if station.safety.min_distance_m:
         allowed = "0 with on_board: places that come so seldom are too old for it; the agents keep apart themselves"
         raise ConfigError("station.safety.min_distance_m", station.safety.min_distance_m, allowed)
-    start = make_scenario(swarm).start
     for index, robot in enumerate(settings.robots):
+        field = f"robots.{robot.name}"
         if robot.id != index + 1:
-            raise ConfigError(f"robots.{robot.name}", robot.id, f"the ids 1 to {swarm.agents} with on_board")
+            raise ConfigError(field, robot.id, f"the ids 1 to {swarm.agents} with on_board")
         if robot.log_rate_hz > rate / 2:
             allowed = f"at most {rate / 2:g} Hz with on_board.polls_hz {rate:g}: a packet comes with every second poll"
-            raise ConfigError(f"robots.{robot.name}.log_rate_hz", robot.log_rate_hz, allowed)
-        place = robot.initial_position
-        if math.dist(place[:2], start[:2, index]) > MAX_START_OFFSET_M:
-            x, y = start[:2, index]
+            raise ConfigError(f"{field}.log_rate_hz", robot.log_rate_hz, allowed)
+        (x, y), place = start[:2, index], robot.initial_position
+        if math.dist(place[:2], (x, y)) > MAX_START_OFFSET_M:
             allowed = f"within {MAX_START_OFFSET_M} m of ({x:.2f}, {y:.2f}), where the swarm begins"
-            raise ConfigError(f"robots.{robot.name}.initial_position", list(place), allowed)
+            raise ConfigError(f"{field}.initial_position", list(place), allowed)
 
 
-def _check_mapping(field: str, value: object) -> dict[str, Any]:
-    if value is None:
-        return {}
-    if not isinstance(value, dict):
+def _mapping(field: str, value: object) -> dict[str, Any]:
+    """Return a section of the file, {} if it is empty; ConfigError: it is no section."""
+    if value is not None and not isinstance(value, dict):
         raise ConfigError(field, value, "a mapping of names to values")
-    return value
-
-
-def _without_empty(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out sections without content."""
-    return {key: value for key, value in values.items() if value is not None}
+    return value or {}
 
 
 def _merge(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
@@ -269,39 +264,32 @@ def _merge_robot(
     if robot_type and robot_type not in types:
         allowed = "one of robot_types: " + (", ".join(map(str, types)) or "(there are none)")
         raise ConfigError(f"robots.{name}.type", robot_type, allowed)
-    setting_names = {spec.name for spec in settings_of(RobotSettings)} - {"name"}
-    type_field = f"robot_types.{robot_type}"
-    levels = [("all", common), (type_field, _check_mapping(type_field, types.get(robot_type))), (f"robots.{name}", own)]
-    result: dict[str, Any] = {}
-    for level, values in levels:
-        battery = values.get("battery")
-        if isinstance(battery, dict):
+    type_field, result = f"robot_types.{robot_type}", dict[str, Any]()
+    levels = {"all": common, type_field: _mapping(type_field, types.get(robot_type)), f"robots.{name}": own}
+    for level, values in levels.items():
+        if isinstance(battery := values.get("battery"), dict):
             unused += [f"{level}.battery.{key}" for key in battery if key not in BATTERY_KEYS]
             values = values | {"battery": {key: value for key, value in battery.items() if key in BATTERY_KEYS}}
-        unused += [f"{level}.{key}" for key in values if key not in setting_names]
-        result = _merge(result, _without_empty({key: value for key, value in values.items() if key in setting_names}))
+        unused += [f"{level}.{key}" for key in values if key not in ROBOT_KEYS]
+        known = {key: value for key, value in values.items() if key in ROBOT_KEYS and value is not None}
+        result = _merge(result, known)
     return result
 
 
-def _assign_ids(robots: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """Return ids by robots' names: `id` of the file, else the names' numbers if 1 to N, else the file's order."""
-    numbers = {name: int(match[0]) if (match := TRAILING_NUMBER.search(name)) else 0 for name in robots}
-    if sorted(numbers.values()) != list(range(1, len(robots) + 1)):
-        numbers = {name: position for position, name in enumerate(robots, 1)}
-    ids: dict[str, int] = {}
-    for name, own in robots.items():
-        ids[name] = own.get("id", numbers[name])
-        for other in ids:
-            if other != name and ids[other] == ids[name]:
-                raise ConfigError(f"robots.{name}.id", ids[name], f"an id of its own ({other} has it)")
-    return ids
+def _assign_ids(robots: dict[str, dict[str, Any]]) -> None:
+    """Give ids to robots without: the numbers that end all names if these are 1 to N, else the file's order."""
+    numbers = [int(match[0]) if (match := TRAILING_NUMBER.search(name)) else 0 for name in robots]
+    if sorted(numbers) != list(range(1, len(robots) + 1)):
+        numbers = list(range(1, len(robots) + 1))
+    for own, number in zip(robots.values(), numbers, strict=True):
+        own.setdefault("id", number)
 
 
 def _flatten_parameters(groups: object) -> dict[str, float]:
     """Check parameters of the firmware, {group: {name: value}}; return them by `group.name`. Integers stay integers."""
     result: dict[str, float] = {}
-    for group, names in _check_mapping("firmware_params", groups).items():
-        for name, value in _check_mapping(f"firmware_params.{group}", names).items():
+    for group, names in _mapping("firmware_params", groups).items():
+        for name, value in _mapping(f"firmware_params.{group}", names).items():
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                 raise ConfigError(f"firmware_params.{group}.{name}", value, "a number")
             result[f"{group}.{name}"] = value

@@ -22,8 +22,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from dtsa_agent.core.errors import LocalProtocolError
-
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
 
@@ -106,11 +104,6 @@ def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
     return (v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx)
 
 
-def rotate(q: Quaternion, v: Vector) -> Vector:
-    """Rotate a vector from the axes of a body with this orientation to world axes."""
-    return rotate_inverse((-q[0], -q[1], -q[2], q[3]), v)
-
-
 # -- states ---------------------------------------------------------------------------------------------------------
 CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
 IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
@@ -130,19 +123,10 @@ class State(enum.IntEnum):
     LOST = 7
 
 
-S = State
-CONNECTED = frozenset({S.READY, S.ARMED, S.FLYING, S.LANDING, S.EMERGENCY})
-IN_AIR = frozenset({S.FLYING, S.LANDING})
-TRANSITIONS: dict[State, frozenset[State]] = {
-    S.DISCONNECTED: frozenset({S.CONNECTING}),
-    S.CONNECTING: frozenset({S.READY, S.ARMED, S.FLYING, S.DISCONNECTED, S.EMERGENCY}),
-    S.READY: frozenset({S.ARMED, S.FLYING, S.LANDING, S.EMERGENCY, S.LOST, S.DISCONNECTED}),
-    S.ARMED: frozenset({S.READY, S.FLYING, S.LANDING, S.EMERGENCY, S.LOST, S.DISCONNECTED}),
-    S.FLYING: frozenset({S.READY, S.ARMED, S.LANDING, S.EMERGENCY, S.LOST}),
-    S.LANDING: frozenset({S.READY, S.ARMED, S.FLYING, S.EMERGENCY, S.LOST}),
-    S.EMERGENCY: frozenset({S.LOST, S.CONNECTING, S.DISCONNECTED}),
-    S.LOST: frozenset({S.READY, S.ARMED, S.FLYING, S.LANDING, S.EMERGENCY, S.CONNECTING, S.DISCONNECTED}),
-}
+CONNECTED = frozenset({State.READY, State.ARMED, State.FLYING, State.LANDING, State.EMERGENCY})
+IN_AIR = frozenset({State.FLYING, State.LANDING})
+OFF = frozenset({State.DISCONNECTED, State.CONNECTING})
+WATCHED_OVER = frozenset({State.ARMED, *IN_AIR})
 
 
 class StateMachine:
@@ -152,76 +136,70 @@ class StateMachine:
     """
 
     def __init__(self, on_change: Callable[[State, State, str], None]) -> None:
-        self.state = S.DISCONNECTED
+        self.state = State.DISCONNECTED
         self.reason = "not connected yet"
         self._on_change = on_change
         self.arms_itself = False  # reported by the firmware
-        self._arming_ordered = False  # decides whether a Crazyflie that arms itself counts as armed
+        self.arming_ordered = False  # whether one that arms itself counts as armed
         self._landing = False  # a landing was ordered and is not over
         self._stopped = False  # an emergency stop was sent
 
     def enter(self, state: State, reason: str) -> None:
-        """Enter a state; LocalProtocolError: the present state has no transition to it."""
+        """Enter a state."""
         if state == self.state:
             return
-        if state not in TRANSITIONS[self.state]:
-            raise LocalProtocolError(f"no transition from {self.state.name} to {state.name}")
         before, self.state, self.reason = self.state, state, reason
-        if state in (S.CONNECTING, S.DISCONNECTED):
-            self._landing = self._stopped = self._arming_ordered = False
+        if state in OFF:
+            self._landing = self._stopped = self.arming_ordered = False
         self._on_change(before, state, reason)
-
-    def note_arming(self, armed: bool) -> None:
-        """Note that arming or disarming was ordered."""
-        self._arming_ordered = armed
 
     def note_takeoff(self, reason: str) -> None:
         """Note that a take-off was ordered: an earlier landing is over."""
         self._landing = False
-        if self.state == S.LANDING:
-            self.enter(S.FLYING, reason)
+        if self.state == State.LANDING:
+            self.enter(State.FLYING, reason)
         self.reason = reason
 
     def note_landing(self, reason: str) -> None:
         """Note that a landing was ordered."""
         self._landing = True
-        if self.state in (S.FLYING, S.ARMED, S.READY):
-            self.enter(S.LANDING, reason)
+        if self.state in (State.FLYING, State.ARMED, State.READY):
+            self.enter(State.LANDING, reason)
 
     def note_emergency_stop(self, reason: str) -> None:
         """Note that an emergency stop was ordered."""
         self._stopped = True
-        if self.state not in (S.DISCONNECTED, S.CONNECTING):
-            self.enter(S.EMERGENCY, reason)
+        if self.state not in OFF:
+            self.enter(State.EMERGENCY, reason)
 
     def note_lost_link(self, reason: str) -> None:
         """Note that no packet arrived for too long, or that the link broke."""
         if self.state in CONNECTED:
-            self.enter(S.LOST, reason)
+            self.enter(State.LOST, reason)
 
     def update(self, info: int) -> None:
         """Enter the state that the supervisor's bits in a log packet show."""
-        if self.state in (S.DISCONNECTED, S.EMERGENCY):
+        if self.state in (State.DISCONNECTED, State.EMERGENCY):
             return
         troubles = (IS_LOCKED, "locked after an emergency stop"), (IS_TUMBLED, "tumbled"), (IS_CRASHED, "crashed")
         reasons = [reason for bit, reason in troubles if info & bit]
         if reasons or self._stopped:
-            self.enter(S.EMERGENCY, reasons[0] if reasons else self.reason)
+            self.enter(State.EMERGENCY, reasons[0] if reasons else self.reason)
             return
         self.arms_itself = bool(info & AUTO_ARM)
-        reason = "heard again" if self.state == S.LOST else ""
+        reason = "heard again" if self.state == State.LOST else ""
         if info & IS_FLYING:
             if not self._landing:
-                self.enter(S.FLYING, reason or "in the air")
-            elif self.state != S.LANDING:
-                self.enter(S.LANDING, reason or self.reason)
+                self.enter(State.FLYING, reason or "in the air")
+            elif self.state != State.LANDING:
+                self.enter(State.LANDING, reason or self.reason)
             return
-        if self.state == S.LANDING or (self.state == S.LOST and self._landing):
+        if self.state == State.LANDING or (self.state == State.LOST and self._landing):
             reason = "landed"
         if self.state in IN_AIR or self._landing:
-            self._arming_ordered = False
+            self.arming_ordered = False
         self._landing = False
-        if self._arming_ordered if self.arms_itself else info & IS_ARMED:
-            self.enter(S.ARMED, reason or "armed")
+        if self.arming_ordered if self.arms_itself else info & IS_ARMED:
+            self.enter(State.ARMED, reason or "armed")
         else:
-            self.enter(S.READY, reason or "motors locked")
+            self.enter(State.READY, reason or "motors locked")

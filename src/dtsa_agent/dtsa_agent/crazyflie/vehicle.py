@@ -1,4 +1,21 @@
-"""One Crazyflie as the bridge knows it: its connection, its states, what is known of it, and the orders it takes."""
+"""One Crazyflie as the bridge knows it: its connection, what is known of it, the orders it takes, and what it flies.
+
+A set-point's way from the graph to the motors, and what may stop it:
+
+1. **Topic.** `commands` reads each vehicle's `cmd_*` topics (`node/topics`) in a thread of its own, turns a message
+   into a `Setpoint` in the Crazyflies' world (`state`), dated by its publication, and refuses one that is too fast or
+   leads out of the fence (`safety`).
+2. **Whether it counts now** is decided here, in :meth:`CrazyflieVehicle.command`. It does not count unless the vehicle
+   is armed or flies, after a safety rule has taken the controls (`overruled`, until the next take-off), while motion
+   capture does not see the vehicle (`paused`), or while a take-off or go-to is flown to its end (`guard_until`). One
+   that counts ends whatever else was flown: a braking, an order that is being repeated.
+3. **The link** (`link`) gives it to cflib, whose driver (`drivers`) keeps the newest one until it can be sent.
+4. **When the stream stops.** `safety` checks the command's age 50 times a second: first the vehicle holds its place
+   (`hold_place`), then it lands (`land`). Both brake by a stream of zero velocity, then give an order to the firmware's
+   high-level commander. The order goes out before the end of the stream, or the motors would stop for a moment.
+
+These are all the files on its way: `topics`, `commands`, `state`, `safety`, `vehicle`, `link`, `drivers`.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +24,30 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .controls import GO_TO, SLOW_MPS, TAKEOFF, Controls, end_of_stream, landing_s, too_short
+from .commands import Setpoint, velocity_world
 from .link import CrazyflieLink, Send
 from .onboard import ENABLE
-from .positions import EXTPOSE, PoseTracker, SettlingCheck
+from .orders import GO_TO, LAND, REPEAT_S, TAKEOFF, RepeatedOrder, end_of_stream, landing_s, too_short
+from .positions import PoseTracker, SettlingCheck, quantile
 from .safety import EstimateWatch, WatchedVehicle, outside_fence
 from .settings import GroundStationSettings, RobotSettings
-from .state import HL_ACTIVE, IN_AIR, IS_FLYING, Quaternion, State, StateMachine, Vector, VehicleState, to_map, yaw_of
+from .state import (
+    HL_ACTIVE,
+    IN_AIR,
+    IS_FLYING,
+    OFF,
+    WATCHED_OVER,
+    Quaternion,
+    State,
+    StateMachine,
+    Vector,
+    VehicleState,
+    to_map,
+    yaw_of,
+)
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
@@ -25,28 +55,17 @@ LOW_M = 0.1  # this close to the floor there is nothing left to land from
 LOWEST_HOLD_M = 0.1
 WINDOW_S = 1.0  # over which packets are counted
 COMPLAIN_S = 5.0  # a vehicle's refused poses stand in the log this often at most
-OFF = frozenset({State.DISCONNECTED, State.CONNECTING})
-WATCHED_OVER = frozenset({State.ARMED, State.FLYING, State.LANDING})
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """State of one vehicle for status and diagnostics."""
-
-    name: str
-    state: State
-    reason: str
-    vehicle: VehicleState | None
-    log_age: float  # s; infinite before the first packet
-    command_age: float  # s; infinite before the first command
-    link_quality: float  # 0..1
-    rssi: int
-    sent: int
-    received: int
-    refused: int  # streamed commands that were not for this state
-    latency_p99: float  # s; 0 before the first command
-    command_hz: float
-    tracker: PoseTracker | None = None  # None: there is no motion capture
+# A landing is planned as if from rest, and a path to a place swings out by metres if it begins at high speed: before a
+# landing and before holding a place the vehicle is first braked by streamed setpoints of zero velocity.
+SLOW_MPS = 0.25
+BRAKE_LIMIT_S = 1.5
+DOWN_M = 0.04  # m: it stands, by motion capture
+STANDSTILL: Vector = (0.0, 0.0, 0.0)
+SINK_MPS = 0.3  # of a vehicle that does not know where it is
+SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
+BLIND_REPEAT_S, BLIND_REPEATS = 0.5, 3  # a landing that may not have been heard is ordered again
+BLIND_LAND_S = 2.0
+ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
 
 
 class CrazyflieVehicle:
@@ -57,35 +76,42 @@ class CrazyflieVehicle:
     """
 
     def __init__(
-        self,
-        robot: RobotSettings,
-        station: GroundStationSettings,
-        cache: Path,
-        log: Callable[[str, str], None],
+        self, robot: RobotSettings, station: GroundStationSettings, cache: Path, log: Callable[[str, str], None],
         on_state: Callable[[CrazyflieVehicle, VehicleState], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.robot, self.station, self.name = robot, station, robot.name
-        self.lock = threading.RLock()
+        self.lock = threading.RLock()  # protects all of it
         self.machine = StateMachine(self._changed)
         self.action = "not connected yet"  # the last action taken with it, and why
         self.guarded = False  # the firmware's emergency watchdog is running
         self.last: VehicleState | None = None  # what it has reported last
+        self.refused = 0  # streamed commands that did not count
         self._log, self._publish = log, on_state
         self._log_times: deque[float] = deque(maxlen=200)
         self._trusted_height = 0.0  # m, the last one before the estimate was wrong
         self._complained = -math.inf
         safety, positions, origin = station.safety, station.positions, station.room_origin_in_world
         room = (safety.geofence_min, safety.geofence_max) if safety.geofence else None
-        self.tracker = (
-            PoseTracker(positions, origin, room) if positions.enabled else None
-        )  # None: there is no motion capture
-        self._watch = EstimateWatch(safety.estimate_jump_m, safety.estimate_freeze_s, safety.estimate_error_m)
-        settling = SettlingCheck(
-            robot.estimator_variance_m2, origin, room, positions.agree_m if positions.enabled else None
-        )
-        measured = lambda: self._measured_place(time.monotonic())  # noqa: E731
-        self.link = CrazyflieLink(robot, cache, self._on_state, self._on_broken, self._on_answer, settling, measured)
-        self.controls = Controls(self.link, station, self.machine, self.lock, self._log_info)
+        self.tracker = PoseTracker(positions, origin, room) if positions.enabled else None  # None: no motion capture
+        self._watch = EstimateWatch(safety)
+        agree_m = positions.agree_m if positions.enabled else None
+        self.link = CrazyflieLink(
+            robot, cache, self._on_state, self._on_broken, self._on_answer,
+            lambda: SettlingCheck(robot.estimator_variance_m2, origin, room, agree_m),
+            lambda: self._measured_place(time.monotonic()),
+        )  # fmt: skip
+        # What it flies: a stream of commands, a path, a landing, or a velocity without a place.
+        self._overruled = False  # a rule took the controls: streamed commands do not count until the next take-off
+        self._paused = False  # held because it is not seen: streamed commands do not count until it is
+        self._streaming = False  # the firmware follows streamed commands, not the high-level commander
+        self._held = False  # the stream of commands broke off and the place is being held
+        self._moved = False  # something that makes it fly was sent since it was armed
+        self._command_time = -math.inf  # s, of the last streamed command
+        self._guard_until = 0.0  # s: a take-off or go-to is flown to its end before streamed commands count again
+        self._order: RepeatedOrder | None = None  # the last one, if it is to be repeated
+        # A velocity that is streamed in place of commands, until when (s) or what, and what comes then.
+        self._steady: tuple[Vector, float, Callable[[], bool], Callable[[], None]] | None = None
+        self._landings: list[float] = []  # s: when to repeat a landing that may not have been heard
 
     @property
     def state(self) -> State:
@@ -131,24 +157,23 @@ class CrazyflieVehicle:
 
     def _resume_after_gap(self, state: VehicleState) -> None:
         """The end of a gap: the orders that were given in it may have been lost."""
-        self.controls.end_repeats()
+        self._landings.clear()
         if self.state != State.LANDING:
             return
         drifts = math.hypot(*state.velocity[:2]) > SLOW_MPS
         if state.position[2] < LOW_M and not state.info & HL_ACTIVE:
-            # Down, or about to be: with nothing to fly the end of the stream stops the motors.
-            self.controls.delivery.cancel()
-            self.link.order(end_of_stream)
-        elif drifts or not self.controls.delivery.landing:
+            self._end_stream()  # down, or about to be
+        elif drifts or not self._landing_answered:
             self._log_info("heard again: brakes and lands")
-            self.controls.streaming = True
+            self._streaming = True
             self._brake_then(self._descend)
 
     def _on_answer(self, code: int, result: int) -> None:
         with self.lock:
-            problem = self.controls.delivery.answered(code, result)
-        if problem:
-            self._log("warn", f"{self.name}: {problem}")
+            problem = self._order.take_answer(code, result) if self._order else ""
+            if problem:
+                self._order = None
+                self._log("warn", f"{self.name}: the firmware {problem}")
 
     def _on_broken(self, reason: str) -> None:
         with self.lock:
@@ -167,7 +192,7 @@ class CrazyflieVehicle:
                 self._log("warn", f"{self.name}: a pose of motion capture is refused: {problem}")
             due = not problem and tracker.is_due(now)
         if due:
-            self.link.send_position(position_order(tracker))
+            self.link.send_position(tracker.send)
 
     # -- what is known of it ----------------------------------------------------------------------------------------
     def _measured_place(self, now: float) -> Vector | None:
@@ -181,42 +206,36 @@ class CrazyflieVehicle:
         problem = self.tracker.why_estimate_wrong(self.last.position, time.monotonic())
         return f"{self.name} {problem}" if problem else ""
 
-    @property
-    def _speed(self) -> float:
-        return 0.0 if self.last is None else math.hypot(*self.last.velocity)
-
-    @property
-    def _height(self) -> float:
-        return self.last.position[2] if self.last is not None else 1.0
-
     def log_age(self, now: float) -> float:
         """Seconds since the last log packet; infinite before the first one."""
         return now - self._log_times[-1] if self._log_times else math.inf
+
+    def command_age(self, now: float) -> float:
+        """Seconds since the last streamed command; infinite before the first one."""
+        return now - self._command_time
+
+    def link_quality(self, now: float) -> float:
+        """Share of the log packets that arrive, or of packets that the radio need not repeat, 0 to 1."""
+        recent = sum(now - t <= WINDOW_S for t in self._log_times.copy())
+        return min(1.0, recent / (self.robot.log_rate_hz * WINDOW_S), getattr(self.link.driver, "quality", 1.0))
+
+    def command_rate(self, now: float) -> tuple[float, float]:
+        """Return streamed commands sent per second, and the 99th percentile of their latency, s."""
+        sent = self.link.setpoints.copy()
+        latencies = deque(latency for _, latency in sent)
+        return sum(now - t <= WINDOW_S for t, _ in sent) / WINDOW_S, quantile(latencies, 0.99)
 
     def watched_state(self, now: float) -> WatchedVehicle:
         """What the safety rules need."""
         with self.lock:
             battery, last, wrong = self.robot.battery, self.last, self._watch.wrong
             place = self._measured_place(now) if wrong else None if last is None else last.position
+            streamed = (self._streaming or self._held) and self._command_time > -math.inf and not wrong
             return WatchedVehicle(
                 self.name, self.state, None if place is None else to_map(place, self.station.room_origin_in_world),
                 math.inf if last is None else last.battery, battery.flight_warning, battery.flight_landing,
-                self.log_age(now), None if wrong else self.controls.setpoint_age(now),
+                self.log_age(now), self.command_age(now) if streamed else None,
                 None if self.tracker is None else self.tracker.age(now), wrong, now - self._watch.since,
-            )  # fmt: skip
-
-    def snapshot(self, now: float) -> Snapshot:
-        """Everything for the status."""
-        with self.lock:
-            link = self.link
-            recent = sum(1 for t in self._log_times if now - t <= WINDOW_S)
-            quality = min(1.0, recent / (self.robot.log_rate_hz * WINDOW_S), link.counters.quality)
-            delays = sorted(link.latencies.copy())
-            sends = sum(1 for t in link.send_times.copy() if now - t <= WINDOW_S)
-            return Snapshot(
-                self.name, self.state, self.action, self.last, self.log_age(now), self.controls.command_age(now),
-                quality, link.counters.rssi, link.counters.sent, link.received, self.controls.refused,
-                delays[int(0.99 * (len(delays) - 1))] if delays else 0.0, sends / WINDOW_S, self.tracker,
             )  # fmt: skip
 
     # -- connection -------------------------------------------------------------------------------------------------
@@ -224,8 +243,9 @@ class CrazyflieVehicle:
         """Connect in a thread of its own; `done` is called when it has worked out or not."""
         with self.lock:
             self.machine.enter(State.CONNECTING, f"connecting to {self.robot.uri}")
-            self.guarded = False
-            self.controls.reset()
+            self.guarded = self._overruled = self._paused = self._streaming = self._held = False
+            self._command_time, self._steady, self._order = -math.inf, None, None
+            self._landings.clear()
 
         def run() -> None:
             try:
@@ -244,14 +264,20 @@ class CrazyflieVehicle:
         threading.Thread(target=run, name=f"{self.name}-connect", daemon=True).start()
 
     # -- orders -----------------------------------------------------------------------------------------------------
-    def _why_not_steerable(self) -> str:
-        """Why it takes no orders to fly somewhere; empty if it does."""
-        if self.state == State.FLYING and not self.controls.overruled:
-            return ""
-        return f"{self.name} is {self.state_text}" + (f" ({self.action})" if self.controls.overruled else "")
-
-    def _order_flight(self, kind: str, action: Send, duration: float, *, again: bool = True) -> None:
-        self.controls.fly(kind, action, duration, time.monotonic(), again=again)
+    def command(self, setpoint: Setpoint) -> bool:
+        """Stream a command; False when it is not for the present state."""
+        with self.lock:
+            early = setpoint.stamp < self._guard_until
+            if self.state not in ACCEPTS_COMMANDS or self._overruled or self._paused or early:
+                self.refused += 1
+                return False
+            if self._held:
+                self._log_info("commands again")
+            self._command_time = setpoint.stamp
+            self._moved = self._streaming = True
+            self._held, self._steady, self._order = False, None, None
+            self.link.stream(setpoint)
+            return True
 
     def arm(self, arm: bool) -> str:
         """Let the motors run, or lock them."""
@@ -261,8 +287,8 @@ class CrazyflieVehicle:
             if arm and (problem := self._why_misplaced()):
                 return problem
             self.action = "arming" if arm else "disarming"
-            self.machine.note_arming(arm)
-            self.controls.moved = False
+            self.machine.arming_ordered = arm
+            self._moved = False
             if not self.machine.arms_itself:  # disarmed, it would arm itself again at once
                 self.link.order(lambda cf: cf.supervisor.send_arming_request(arm))
             elif self.last is not None:
@@ -273,52 +299,50 @@ class CrazyflieVehicle:
         """Climb to a height (m above the floor) within a duration (s); one that arms itself need not be armed."""
         with self.lock:
             arms = self.state == State.READY and self.machine.arms_itself
-            if not arms and self.state not in WATCHED_OVER:
-                return f"{self.name} is {self.state_text}, not armed"
-            if self._watch.wrong:
-                return f"{self.name}: {self._watch.wrong}"
-            if not math.isfinite(height):
-                return f"{self.name}: height {height} m is not finite"
             on_ground, last = arms or self.state == State.ARMED, self.last
-            critical = self.robot.battery.voltage_critical
-            if on_ground and last is not None and last.battery < critical:
-                return f"{self.name}: battery {last.battery:.2f} V (voltage_critical is {critical:g} V)"
-            if on_ground and (problem := self._why_misplaced()):
-                return problem
-            x, y, z = (0.0, 0.0, 0.0) if last is None else last.position
-            safety, origin = self.station.safety, self.station.room_origin_in_world
-            if last is not None and (problem := outside_fence((x, y, height), safety, origin)):
-                return f"{self.name}: the take-off to {problem}"
-            if problem := too_short(duration, height - max(z, 0.0), self.station.max_speed_mps):
+            if last is None or not (arms or self.state in WATCHED_OVER):
+                return f"{self.name} is {self.state_text}, not armed"
+            (x, y, z), critical = last.position, self.robot.battery.voltage_critical
+            problem = self._watch.wrong
+            if not problem and not math.isfinite(height):
+                problem = f"height {height} m is not finite"
+            if not problem and on_ground and last.battery < critical:
+                problem = f"battery {last.battery:.2f} V (voltage_critical is {critical:g} V)"
+            if not problem and (outside := self._outside_fence((x, y, height))):
+                problem = f"the take-off to {outside}"
+            problem = problem or too_short(duration, height - max(z, 0.0), self.station.max_speed_mps)
+            if problem:
                 return f"{self.name}: {problem}"
-            if arms and (problem := self.arm(True)):
+            if on_ground and (problem := self._why_misplaced() or (self.arm(True) if arms else "")):
                 return problem
-            self.controls.overruled, self.controls.moved = False, True
-            if (
-                self.station.on_board.enabled
-            ):  # the app had been overruled by the last landing: it has to be enabled anew
+            self._overruled, self._moved = False, True
+            if self.station.on_board.enabled:  # the last landing overruled the app: it has to be enabled anew
                 self.link.set_parameter(ENABLE, 0)
-            self.controls.end_blind_flight()
             self.machine.note_takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
-            if on_ground or last is None:
-                self.controls.streaming = True  # an old stream may still be in force
-                self._order_flight(
-                    TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration
-                )
+            if on_ground:
+                self._streaming = True  # an old stream may still be in force
+                self._fly(TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration)
             else:  # the firmware takes off from the ground only
                 yaw = yaw_of(last.orientation)
-                self._order_flight(
-                    GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration
-                )
+                self._fly(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
             return ""
+
+    def _outside_fence(self, place: Vector) -> str:
+        return outside_fence(place, self.station.safety, self.station.room_origin_in_world)
+
+    def _why_not_steerable(self) -> str:
+        """Why it takes no orders to fly somewhere; empty if it does."""
+        if self.state == State.FLYING and not self._overruled:
+            return ""
+        return f"{self.name} is {self.state_text}" + (f" ({self.action})" if self._overruled else "")
 
     def enable(self, on: bool) -> str:
         """Let the agent on board steer, or take the controls back: it then hovers."""
         with self.lock:
             if on and (problem := self._why_not_steerable()):
                 return problem
-            if on and (left := self.controls.guard_until - time.monotonic()) > 0.0:
+            if on and (left := self._guard_until - time.monotonic()) > 0.0:
                 return f"{self.name} still flies its take-off or go_to, for {left:.1f} s"
             self._log_info(f"the agent on board {'may steer' if on else 'may not steer any more'}")
             self.link.set_parameter(ENABLE, int(on))
@@ -331,18 +355,15 @@ class CrazyflieVehicle:
                 return problem
             if not all(map(math.isfinite, (*place, yaw, duration))):
                 return f"{self.name}: the goal is not finite"
-            here = (0.0, 0.0, 0.0) if self.last is None else self.last.position
+            here = STANDSTILL if self.last is None else self.last.position
             goal = (here[0] + place[0], here[1] + place[1], here[2] + place[2]) if relative else place
-            if problem := outside_fence(goal, self.station.safety, self.station.room_origin_in_world):
+            if problem := self._outside_fence(goal):
                 return f"{self.name}: the goal {problem}"
             if problem := too_short(duration, math.dist(goal, here), self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
             self.action = "go_to"
-
-            def order(cf: Any) -> None:
-                cf.high_level_commander.go_to(*place, yaw, duration, relative)
-
-            self._order_flight(GO_TO, order, duration, again=not relative)
+            order: Send = lambda cf: cf.high_level_commander.go_to(*place, yaw, duration, relative)  # noqa: E731
+            self._fly(GO_TO, order, duration, again=not relative)
             return ""
 
     def hold_place(self, reason: str, *, stale: bool = False, until_seen: bool = False) -> None:
@@ -358,67 +379,49 @@ class CrazyflieVehicle:
                 return
             self.action = f"hold: {reason}"
             if self._watch.wrong:
-                self.controls.overruled = True
-                self.controls.fly_blindly(time.monotonic())
+                self._overruled, self._held = True, False
+                self._fly_steadily(STANDSTILL, math.inf, lambda: False, lambda: None)
                 return
-            self.controls.paused = until_seen
 
             def stay() -> None:
-                if self.last is None:
-                    return
-                (x, y, z), yaw = self.last.position, yaw_of(self.last.orientation)
-                z = max(z, LOWEST_HOLD_M)
-                self._order_flight(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
-                self.controls.held = stale
+                if self.last is not None:
+                    (x, y, z), yaw = self.last.position, yaw_of(self.last.orientation)
+                    z = max(z, LOWEST_HOLD_M)
+                    self._fly(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
+                    self._held = stale
 
-            self.controls.held = stale
+            self._paused, self._held = until_seen, stale
             self._brake_then(stay)
 
-    def _brake_then(self, action: Callable[[], None]) -> None:
-        """Slow down, then do something."""
-        if self.last is None or self.state not in IN_AIR:
-            action()
-        else:
-            self.controls.brake_then(action, self._speed, time.monotonic())
-
-    def land(
-        self, reason: str, height: float = 0.0, duration: float = 0.0, note: Callable[[str], None] | None = None
-    ) -> str:
+    def land(self, reason: str, height: float = 0.0, duration: float = 0.0) -> str:
         """Sink to a height (m above the floor) within a duration (s; 0: at the station's speed) and stop the motors.
 
-        A landing is never refused for its numbers: one that would be too fast takes longer, and `note` is told.
+        A landing is never refused for its numbers: one that would be too fast takes longer, and the log says so.
         """
         with self.lock:
-            controls, height = self.controls, height if math.isfinite(height) else 0.0
+            height = height if math.isfinite(height) else 0.0
             if self.state not in (*WATCHED_OVER, State.LOST):
                 return f"{self.name} is {self.state_text}"
-            if self.state == State.ARMED and not controls.moved:
+            if self.state == State.ARMED and not self._moved:
                 return self.arm(False)  # a landing would start the motors
-            controls.overruled = True
-            if self.state == State.LANDING and (not self._watch.wrong or controls.sinks_blindly):
+            self._overruled = True
+            sinks_blindly = self._steady is not None and self._steady[0] != STANDSTILL
+            if self.state == State.LANDING and (not self._watch.wrong or sinks_blindly):
                 return ""
             self.action = f"land: {reason}"
-            # A blind landing must end a stream that the firmware may still follow.
-            controls.streaming |= self.state == State.LOST
+            self._streaming |= self.state == State.LOST  # it must end a stream that the firmware may still follow
             self.machine.note_landing(self.action)
             if self._watch.wrong:
-                now = time.monotonic()
-                seen = self._measured_place(now)
-                controls.fly_blindly(now, self._trusted_height if seen is None else seen[2])
+                seen, self._held = self._measured_place(time.monotonic()), False
+                height_s = (self._trusted_height if seen is None else seen[2]) / SINK_MPS
+                self._fly_steadily((0.0, 0.0, -SINK_MPS), height_s + SINK_MORE_S, self._is_down, self._end_stream)
                 return ""
             way = self._height - height
             if 0.0 < duration < (seconds := landing_s(way, duration, self.station)):
                 why = too_short(duration, way, self.station.max_speed_mps)
-                longer = f"{self.name}: landing takes {seconds:.2f} s: {why}"
-                self._log("warn", longer)
-                if note is not None:
-                    note(longer)
+                self._log("warn", f"{self.name}: landing takes {seconds:.2f} s: {why}")
             self._brake_then(lambda: self._descend(height, duration))
             return ""
-
-    def _descend(self, height: float = 0.0, duration: float = 0.0) -> None:
-        """Straight down from where it is now; parameters as of `land`."""
-        self.controls.land(height, self._height - height, duration, time.monotonic())
 
     def stop(self, reason: str) -> None:
         """Emergency stop: motors off for good."""
@@ -426,8 +429,8 @@ class CrazyflieVehicle:
             if self.state in OFF:
                 return
             self.action = f"emergency stop: {reason}"
-            self.controls.overruled = True
-            self.controls.stop()
+            self._overruled = True
+            self._steady = self._order = None
             for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
                 self.link.order(lambda cf: cf.supervisor.send_emergency_stop())
             self.machine.note_emergency_stop(self.action)
@@ -440,10 +443,86 @@ class CrazyflieVehicle:
             if self.state == State.FLYING:
                 self.hold_place("the stream of commands was declared over")  # tells the firmware, too
             else:
-                self.controls.streaming = False
-                self.controls.delivery.cancel()
+                self._streaming, self._order = False, None
                 self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop(remain_ms))
             return ""
+
+    # -- what it flies ----------------------------------------------------------------------------------------------
+    @property
+    def _height(self) -> float:
+        return self.last.position[2] if self.last is not None else 1.0
+
+    @property
+    def _speed(self) -> float:
+        return math.hypot(*self.last.velocity) if self.last is not None else 0.0
+
+    @property
+    def _landing_answered(self) -> bool:
+        return self._order is not None and self._order.kind == LAND and self._order.answered
+
+    def _fly(self, kind: str, action: Send, duration: float, *, again: bool = True) -> None:
+        """An order to the high-level commander, and only then the end of the stream of setpoints.
+
+        The other way round the high-level commander would have nothing to fly for a moment, and would stop the motors.
+        Streamed commands do not count for the duration (s). `again`: the order is repeated until it is answered.
+        """
+        now, streaming = time.monotonic(), self._streaming
+        self._streaming = self._held = False
+        self._guard_until, self._steady = now + duration, None
+        end = end_of_stream if streaming else None
+
+        def run(cf: Any) -> None:
+            action(cf)
+            if end is not None:
+                end(cf)
+                if again:
+                    action(cf)
+
+        self.link.order(run)
+        self._order = RepeatedOrder(kind, run, end, now + REPEAT_S) if again else None
+
+    def _descend(self, height: float = 0.0, duration: float = 0.0) -> None:
+        """Straight down from where it is now; parameters as of `land`."""
+        seconds = landing_s(self._height - height, duration, self.station)
+        self._fly(LAND, lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
+
+    def _brake_then(self, action: Callable[[], None]) -> None:
+        """Slow down, then do something."""
+        if self.last is None or self.state not in IN_AIR:
+            action()
+        else:
+            self._fly_steadily(STANDSTILL, BRAKE_LIMIT_S, lambda: self._speed < SLOW_MPS, action)
+
+    def _fly_steadily(
+        self, velocity: Vector, limit_s: float, is_over: Callable[[], bool], action: Callable[[], None]
+    ) -> None:
+        """Stream a velocity (m/s), which needs no place, for so long at most or until it is over; then do something."""
+        now = time.monotonic()
+        self._order, self._steady = None, (velocity, now + limit_s, is_over, action)
+        self._go_on(now)
+
+    def _go_on(self, now: float) -> None:
+        """Send the next packet of such a stream, if there is one."""
+        if self._steady is None:
+            return
+        velocity, until, is_over, action = self._steady
+        if self.state not in IN_AIR:
+            self._steady = None
+        elif now > until or is_over():
+            self._steady = None
+            action()
+        else:
+            self._streaming = True
+            self.link.stream(velocity_world(velocity, 0.0, now))
+
+    def _is_down(self) -> bool:
+        seen = self._measured_place(time.monotonic())
+        return seen is not None and seen[2] < DOWN_M
+
+    def _end_stream(self) -> None:
+        """End the stream: with nothing to fly the motors stop."""
+        self._streaming, self._order = False, None
+        self.link.order(end_of_stream)
 
     # -- called regularly -------------------------------------------------------------------------------------------
     def declare_lost(self, reason: str, now: float) -> None:
@@ -452,45 +531,34 @@ class CrazyflieVehicle:
             was_in_air = self.state in IN_AIR
             self.machine.note_lost_link(reason)
             if not was_in_air:
-                self.controls.delivery.cancel()  # a take-off that comes late would surprise
-            elif self.link.connected and not self.controls.delivery.landing:
+                self._order = None  # a take-off that comes late would surprise
+            elif self.link.connected and not self._landing_answered:
                 self.land(reason)
-                self.controls.repeat_landing(now)
+                self._landings = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
 
-    def tick(self, now: float) -> None:
-        """Called 50 times a second: goes on braking, and sends again what has not been answered."""
+    def tick(self, now: float, feed: bool) -> None:
+        """Called 50 times a second: goes on with a stream of its own, and sends again what has not been answered.
+
+        :param feed: send the emergency stop watchdog, and blind landings that are due.
+        """
         with self.lock:
-            if self.controls.paused and self.tracker is not None:
-                self.controls.paused = self.tracker.age(now) > self.station.safety.position_age_s
-            blind = self.controls.continue_blind_flight(self.state in IN_AIR, self._measured_place(now), now)
-            if not blind and self.last is not None:
-                self.controls.slow_down(self._speed, now)
+            if self._paused and self.tracker is not None:
+                self._paused = self.tracker.age(now) > self.station.safety.position_age_s
+            self._go_on(now)
             if self.state not in OFF:
                 self.link.order_log(now)
-            if self.state in WATCHED_OVER and (order := self.controls.delivery.due(now)) is not None:
+            if self.state in WATCHED_OVER and self._order is not None and (order := self._order.due(now)) is not None:
                 self.link.order(order)
+            if feed:
+                self._feed_watchdog(now)
 
-    def feed_watchdog(self, now: float, watchdog: bool) -> None:
-        """What has to be sent regularly: the emergency stop watchdog, and blind landings."""
-        with self.lock:
-            self.controls.repeat_due_landing(self._height, now)
-            # From the first arming on: once it has begun, the firmware locks itself when it ends.
-            self.guarded |= watchdog and self.state in WATCHED_OVER
-            self.link.guarded = self.guarded
-            if self.guarded and self.state not in (*OFF, State.EMERGENCY):
-                self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
-
-
-def position_order(tracker: PoseTracker) -> Send:
-    """Return an order that sends a Crazyflie the last accepted pose."""
-    pose = tracker.last
-    assert pose is not None
-
-    def send(cf: Any) -> None:
-        if tracker.settings.send == EXTPOSE and pose.orientation is not None:
-            cf.loc.send_extpose(pose.position, pose.orientation)
-        else:
-            cf.loc.send_extpos(pose.position)
-        tracker.count_sent(pose, time.time())
-
-    return send
+    def _feed_watchdog(self, now: float) -> None:
+        if self._landings and now >= self._landings[0]:
+            self._landings.pop(0)
+            self._streaming = True  # it must end a stream that the firmware may still follow
+            self._descend(0.0, BLIND_LAND_S)
+        # From the first arming on: once it has begun, the firmware locks itself when it ends.
+        self.guarded |= self.station.safety.emergency_watchdog and self.state in WATCHED_OVER
+        self.link.guarded = self.guarded
+        if self.guarded and self.state not in (*OFF, State.EMERGENCY):
+            self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())

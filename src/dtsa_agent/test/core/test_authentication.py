@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,18 +22,14 @@ def test_golden_tag() -> None:
     assert Authenticator(KEY, 5).seal(b"frame", 7).hex() == "6672616d6500ba891a"
 
 
-@pytest.mark.parametrize(("change", "counter"), [
-    (lambda frame: bytes([frame[0] ^ 1]) + frame[1:], "forged"),
-    (lambda frame: frame[:-1] + bytes([frame[-1] ^ 0x80]), "forged"),
-    (lambda frame: frame[:-1], "forged"),
-    (lambda frame: frame + b"\0", "forged"),
-    (lambda frame: frame[:4], "truncated"),
-    (lambda frame: b"", "truncated"),
+@pytest.mark.parametrize("change", [
+    lambda frame: bytes([frame[0] ^ 1]) + frame[1:], lambda frame: frame[:-1] + bytes([frame[-1] ^ 0x80]),
+    lambda frame: frame[:-1], lambda frame: frame + b"\0", lambda frame: frame[:4], lambda frame: b"",
 ])  # fmt: skip
-def test_changed_frames(change, counter: str) -> None:  # type: ignore[no-untyped-def]
+def test_changed_frames(change: Callable[[bytes], bytes]) -> None:
     auth = Authenticator(KEY)
     assert auth.open(change(auth.seal(b"position and so on", 12)), 12) is None
-    assert getattr(auth, counter) == auth.rejected == 1
+    assert auth.rejected == 1
 
 
 def test_replays_and_foreign_frames() -> None:
@@ -42,7 +40,7 @@ def test_replays_and_foreign_frames() -> None:
     assert Authenticator(KEY, session=2).open(frame, 100) is None
     assert Authenticator(KEY[::-1], session=1).open(frame, 100) is None
     assert auth.open(frame, 101, late=1) == b"frame"
-    assert auth.forged == 2
+    assert auth.rejected == 2
 
 
 @pytest.mark.parametrize("key", [b"", bytes(15), bytes(33)])

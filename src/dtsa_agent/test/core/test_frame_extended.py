@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core import Frame, LocalProtocolError, RemoteProtocolError, encode_frame
 from dtsa_agent.core.frame import EXTENDED_LENGTH, ExtendedFrame, Gossip, decode_extended, encode_extended
-from dtsa_agent.core.reference import frame_extended as plain
+from dtsa_agent.core.reference import frame as plain
 
 OWN = Frame(3, 17, 1, (1.0, 2.0, -3.0), (0.5, -0.5, 0.0), (1.0, 0.0, 0.0))
 FULL = ExtendedFrame(
@@ -139,7 +139,7 @@ def test_what_is_at_a_limit_can_be_said(change: dict[str, object]) -> None:
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_gossip_fits_up_to_a_step_before_it_saturates(sign: float) -> None:
     step, rest = 0.002, (0.0, 0.0, 0.0)
-    far, fast = sign * 2.0 * step * 8190, sign * plain.VELOCITY_STEP * 510
+    far, fast = sign * 2.0 * step * 8190, sign * plain.GOSSIP_VELOCITY_STEP * 510
     for axis in range(3):
         for value, fits in ((1.0, True), (1.001, False)):
             at = tuple(far * value if k == axis else 0.0 for k in range(3))

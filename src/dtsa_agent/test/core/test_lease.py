@@ -10,7 +10,7 @@ from lease_helpers import FAR, STATEMENTS, Air, is_anchor, make, still
 
 from dtsa_agent.core import ConfigError, Scenario, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import OPEN, ExtendedFrame, Frame, Gossip, decode_extended, encode_extended
-from dtsa_agent.core.reference.lease.decide import uses_open_turn
+from dtsa_agent.core.reference.lease.events import uses_open_turn
 from dtsa_agent.core.reference.lease.issue import open_block
 from dtsa_agent.core.reference.lease.memory import Memory
 from dtsa_agent.core.reference.table import Rules
@@ -208,8 +208,8 @@ def test_the_chance_of_an_open_turn_halves_five_times_at_most() -> None:
     rules = Rules(agents=12, slot_s=0.01, anchor_every=3, main_every=15)
     taken = {}
     for attempts in (4, 5, 6, 200):
-        memory = Memory(rules, woke=0, attempts=attempts, probation=True)
-        taken[attempts] = {slot for slot in range(6000) if uses_open_turn(memory, 3, slot)}
+        memory = Memory(rules, 3, woke=0, attempts=attempts, probation=True)
+        taken[attempts] = {slot for slot in range(6000) if uses_open_turn(memory, slot)}
     assert taken[5] == taken[6] == taken[200]
     assert 1.5 * len(taken[5]) < len(taken[4]) < 2.5 * len(taken[5])
 

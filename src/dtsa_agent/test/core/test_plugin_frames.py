@@ -10,8 +10,7 @@ import pytest
 
 from dtsa_agent.core import Agent, ConfigError, PluginError, SlotOutcome, Swarm, SwarmConfig
 from dtsa_agent.core.authentication import Authenticator
-from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.core.plugins.kinds import Table
+from dtsa_agent.core.plugins.entry_points import Table, make_swarm
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES
 
 KEY = bytes(range(16))

@@ -17,7 +17,7 @@ from dtsa_agent.core import Frame, Swarm, SwarmConfig, decode_frame, encode_fram
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.core.frame import TAG_LENGTH, ExtendedFrame, Gossip, decode_extended, encode_extended, position_step
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.reference import arithmetic, frame, frame_extended, policies
+from dtsa_agent.core.reference import arithmetic, frame, policies
 from dtsa_agent.core.reference.frame import tag
 from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_agent.core.registry import REASONS
@@ -59,7 +59,7 @@ def test_both_say_the_same(said: Frame, extent: float) -> None:
 @given(extended, st.sampled_from(EXTENTS))
 def test_both_say_the_same_about_others(said: ExtendedFrame, extent: float) -> None:
     step = position_step(extent)
-    assert outcome(lambda: encode_extended(said, extent)) == outcome(lambda: frame_extended.encode_extended(said, step))
+    assert outcome(lambda: encode_extended(said, extent)) == outcome(lambda: frame.encode_extended(said, step))
 
 
 def without_intent(heard: Frame, data: bytes) -> Frame:
@@ -81,7 +81,7 @@ data_of |= sections.map(lambda given: b"\x12\x05\x03" + bytes([given[0] << 2]) +
 def test_both_understand_the_same(data: bytes) -> None:
     step = position_step(EXTENTS[0])
     assert outcome(lambda: decode_frame(data)) == outcome(lambda: without_intent(frame.decode(data, step), data))
-    assert outcome(lambda: decode_extended(data)) == outcome(lambda: frame_extended.decode_extended(data, step))
+    assert outcome(lambda: decode_extended(data)) == outcome(lambda: frame.decode_extended(data, step))
 
 
 def test_the_arcsine_is_one() -> None:

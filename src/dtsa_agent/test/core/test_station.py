@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.reference import station as reference
-from dtsa_agent.core.reference.agent import Agent
-from dtsa_agent.core.reference.table import Rules, Table
+from dtsa_agent.core.reference import datagram
+from dtsa_agent.core.reference.table import Rules
 from dtsa_agent.core.station import FLIES, STATES, VERDICTS, Link, Named, Station, StationSettings
 
 MS = 1_000_000
@@ -45,17 +44,15 @@ def frame_of(policy: str, slot: int, sender: int = 2) -> bytes:
     return bytes(swarm.frame(0))
 
 
-def plain_station(policy: str, link: Link, is_signed: bool, id: int = 1) -> reference.Station:
-    profile = "extended" if policy == "lease" else "paper"
-    c = config_of(policy)
+def read_plainly(data: bytes, policy: str, link: Link, is_signed: bool) -> Any:
+    """What the other statement reads in a datagram."""
+    c, key = config_of(policy), KEY if is_signed else b""
     rules = Rules(
-        agents=5, slot_s=0.01, policy=policy, profile=profile, anchor_every=c.anchor_every, main_every=c.main_every,
-        open_every=c.open_period,
+        agents=5, slot_s=0.01, policy=policy, profile="extended" if policy == "lease" else "paper",
+        anchor_every=c.anchor_every, main_every=c.main_every, open_every=c.open_period,
     )  # fmt: skip
-    places = [(0.0, 0.0, 0.0)] * 5
-    fields = reference.Link(link.header, link.says_late, link.names, link.flight_ns, link.trust_ns)
-    own = reference.Settings(id, 10 * MS, 3, fields, 0, 0.0, KEY if is_signed else b"", 77)
-    return reference.Station(own, rules, Agent(id - 1, rules, Table(id, places, places)), 0, c.main_every)
+    fields = datagram.Link(link.header, link.says_late, link.names, link.flight_ns, link.trust_ns)
+    return datagram.parse_datagram(data, datagram.Settings(1, 10 * MS, 3, fields, 0, 0.0, key, 77), rules)
 
 
 NAMED = "0100 1900 0300 fdff 00000000 00000000"
@@ -72,9 +69,9 @@ NAMED = "0100 1900 0300 fdff 00000000 00000000"
 def test_golden_datagrams(link: Link, names: tuple[Named, ...], head: str, tag: str) -> None:
     """Written by hand from the layout in docs/reference/network.md, but for the tags."""
     station = settings_of("tdma", link, bool(tag))
-    datagram = station.write(PAPER, 1000, 120_000, names)
-    assert datagram == bytes.fromhex(head) + PAPER + bytes.fromhex(tag)
-    parsed = station.read(datagram)
+    data = station.write(PAPER, 1000, 120_000, names)
+    assert data == bytes.fromhex(head) + PAPER + bytes.fromhex(tag)
+    parsed = station.read(data)
     assert (parsed.fault, parsed.sender, parsed.slot, parsed.frame) == ("", 2, 1000, PAPER)
     assert parsed.late_ns == 120_000 * link.says_late
     assert parsed.names == names
@@ -86,15 +83,15 @@ def test_what_is_written_is_read(
 ) -> None:
     station, slot = settings_of(policy, link, is_signed), data.draw(st.integers(0, 2**31))
     frame, names = frame_of(policy, slot), names[: link.names]
-    datagram = station.write(frame, slot, late_ns, tuple(names))
-    assert len(datagram) == station.length
-    parsed = station.read(datagram)
+    written = station.write(frame, slot, late_ns, tuple(names))
+    assert len(written) == station.length
+    parsed = station.read(written)
     assert parsed == ("", 2, slot, late_ns * link.says_late, tuple(map(Named._make, names)), frame)
-    changed = bytearray(datagram)
-    changed[data.draw(st.integers(0, len(datagram) - 1))] ^= data.draw(st.integers(1, 255))
+    changed = bytearray(written)
+    changed[data.draw(st.integers(0, len(written) - 1))] ^= data.draw(st.integers(1, 255))
     if is_signed:
         assert station.read(bytes(changed)).fault
-    plain = plain_station(policy, link, is_signed)._parse(bytes(changed))
+    plain = read_plainly(bytes(changed), policy, link, is_signed)
     compiled = station.read(bytes(changed))
     assert VERDICTS.index(compiled.fault) == (plain if isinstance(plain, int) else 0)
 
@@ -136,11 +133,11 @@ def test_any_bytes_are_refused_or_accepted_alike(
     link: Link, policy: str, is_signed: bool, begin: str, body: bytes, is_fitted: bool
 ) -> None:
     """By both statements, by what only reads, and by a station that listens or has slots."""
-    reader, plain = settings_of(policy, link, is_signed), plain_station(policy, link, is_signed)
+    reader = settings_of(policy, link, is_signed)
     data = {"": b"", "header": link.header, "head": link.header + bytes(2 * link.says_late + 4 * link.names)}[begin]
     data += (frame_of(policy, 7)[:4] if begin == "head" else b"") + body
     data = data.ljust(reader.length, b"\0")[: reader.length] if is_fitted else data
-    read, parsed = reader.read(data), plain._parse(data)
+    read, parsed = reader.read(data), read_plainly(data, policy, link, is_signed)
     assert read.fault in VERDICTS
     assert VERDICTS.index(read.fault) == (parsed if isinstance(parsed, int) else 0)
     for origin_ns in (None, 0):

@@ -99,7 +99,7 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
             output, _ = process.communicate(timeout=60)
             assert process.returncode == 0, output
             for words in (
-                "parameter cf1.params.ring.effect: ring.effect: 300 is not a whole number",
+                "parameter cf1.params.ring.effect: ring.effect: 300 is no uint8_t",
                 "none of cf1, cf2 is in a group of 4", "order /cf1/upload_trajectory",
                 "trajectories are not supported",
             ):  # fmt: skip

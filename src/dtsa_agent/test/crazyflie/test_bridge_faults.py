@@ -20,7 +20,7 @@ pytest.importorskip("cflib")
 from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, settings
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.node.parameters import read_parameters
+from dtsa_agent.crazyflie.node.parameters import why_refused
 from dtsa_agent.crazyflie.state import State
 from dtsa_agent.crazyflie.vehicle import CrazyflieVehicle
 from dtsa_bench.crazyflies.simulated.truth import read_truth
@@ -125,17 +125,17 @@ def test_nobody_else_is_harmed(fault_flight: FaultFlight) -> None:
 @pytest.mark.realtime
 def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> None:
     with (
-        fake_fleet(tmp_path, 3, "--layout", "line", "--half-axes", "1.2", "0.6") as fleet,
+        fake_fleet(tmp_path, 3) as fleet,
         flight(settings(fleet, {"safety": {"min_distance_m": 0.35}})) as pilot,
     ):
         pilot.bridge.connect()
         pilot.take_off()
-        pilot.velocity["cf1"] = (0.0, 0.8, 0.0)
+        pilot.velocity["cf1"] = (-0.58, 0.56, 0.0)  # towards cf2
         wait_for(lambda: pilot.state(1) is State.LANDING and pilot.state(2) is State.LANDING)
         assert pilot.state(3) is State.FLYING
         pilot.logged("cf1: distance: 0.3. m from cf2")
         assert not fleet.events(name="collision")
-        pilot.bridge.note_heartbeat()
+        pilot.bridge.heartbeat = time.monotonic()
         silent = time.monotonic()
         time.sleep(0.7)
         assert pilot.state(3) is State.FLYING
@@ -175,7 +175,6 @@ def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path) -> N
         fleet.fault("refuse_arming", 3)
         with flight(data) as pilot:
             assert sorted(pilot.bridge.connect()) == ["cf1", "cf2"]
-            assert pilot.bridge.connected == 2
             pilot.bridge.order_each(["cf3", "cf4"], lambda v: v.arm(True))
             wait_for(lambda: pilot.state(4) is State.ARMED)
             pilot.bridge.land_all("armed, but still on the ground: there is nothing to land")
@@ -227,20 +226,21 @@ def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_contro
 
 
 def check_parameters(one: CrazyflieVehicle, two: CrazyflieVehicle) -> None:
-    known = read_parameters(one.link)
-    assert (known["ring.effect"].value, known["hlCommander.vland"].value) == (6, 0.5)
+    known = one.link.parameters()
+    assert (known["ring.effect"][1], known["hlCommander.vland"][1]) == (6, 0.5)
     for name, value, problem in (
         ("ring.effect", 7, ""),
-        ("ring.effect", 256, "ring.effect: 256 is not a whole number from 0 to 255"),
-        ("ring.effect", 1.5, "ring.effect: 1.5 is not a whole number from 0 to 255"),
+        ("ring.effect", 256, "ring.effect: 256 is no uint8_t"),
+        ("ring.effect", 1.5, "ring.effect: 1.5 is no uint8_t"),
         ("hlCommander.vland", 0.25, ""),
-        ("hlCommander.vland", float("nan"), "hlCommander.vland: nan is not a number"),
+        ("hlCommander.vland", 1e300, "hlCommander.vland: 1e+300 is no float"),
+        ("hlCommander.vland", float("nan"), "hlCommander.vland: nan is not finite"),
         ("firmware.modified", 1, "firmware.modified is read-only"),
     ):
-        assert known[name].why_refused(value) == problem
+        assert why_refused(name, known[name][0], value) == problem
     one.link.set_parameter("ring.effect", 7)
-    wait_for(lambda: read_parameters(one.link)["ring.effect"].value == 7)
-    assert read_parameters(two.link)["ring.effect"].value == 6
+    wait_for(lambda: one.link.parameters()["ring.effect"][1] == 7)
+    assert two.link.parameters()["ring.effect"][1] == 6
 
 
 @pytest.mark.realtime

@@ -17,7 +17,6 @@ from bridge_helpers import FakeFleet, Flight, fake_fleet, flight
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.link import SIMULATED_RADIO
-from dtsa_agent.crazyflie.node.parameters import read_parameters
 from dtsa_agent.crazyflie.state import State
 
 pytestmark = pytest.mark.slow
@@ -71,7 +70,7 @@ def test_a_dongle_that_is_pulled_is_named_and_its_links_go_on_when_it_is_back(tm
         assert len(fleet.events(name="takeoff")) == 1
         wait_for(lambda: one.link.can_set)
         one.link.set_parameter("ring.effect", 9)
-        wait_for(lambda: read_parameters(one.link)["ring.effect"].value == 9)
+        wait_for(lambda: one.link.parameters()["ring.effect"][1] == 9)
 
 
 def test_without_its_dongle_a_link_says_so_and_does_not_connect_for_ever(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.addresses import RadioUser, check_budget, parse_address, radio_loads
+from dtsa_agent.crazyflie.addresses import Address, check_budget, parse_address, radio_loads
 from dtsa_agent.crazyflie.bridge import Ownership
 from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.crazyflie.settings import load_swarm, parse_swarm
@@ -193,9 +193,11 @@ def test_examples_are_usable(name: str) -> None:
         assert all(low <= p - o <= high for p, o, low, high in inside)
 
 
-def robots(count: int, rate: float, radio: str = "0", bits: str = "2M", channel: int = 80) -> list[RadioUser]:
+def robots(
+    count: int, rate: float, radio: str = "0", bits: str = "2M", channel: int = 80
+) -> list[tuple[Address, float]]:
     uris = [f"radio://{radio}/{channel}/{bits}/E7E7E7E7{k:02X}" for k in range(1, count + 1)]
-    return [RadioUser(f"cf{k}", parse_address(uri), rate, rate) for k, uri in enumerate(uris, 1)]
+    return [(parse_address(uri), rate) for uri in uris]
 
 
 @pytest.mark.parametrize(
@@ -211,9 +213,9 @@ def test_budget_is_what_one_radio_is_known_to_carry(rate: float, most: int, bits
 
 
 def test_budget_counts_each_radio_and_no_udp() -> None:
-    wired = [RadioUser("cf9", parse_address("udp://127.0.0.1:19850"), 100, 100)]
+    wired = [(parse_address("udp://127.0.0.1:19850"), 100.0)]
     loads = radio_loads(robots(4, 50) + robots(3, 50, "1", channel=100) + wired)
-    assert [(load.medium, len(load.robots)) for load in loads] == [("radio 0", 4), ("radio 1", 3)]
+    assert [(load.medium, load.count) for load in loads] == [("radio 0", 4), ("radio 1", 3)]
     assert all(load.fits for load in loads)
 
 

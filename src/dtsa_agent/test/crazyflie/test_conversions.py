@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -66,61 +67,60 @@ def test_quaternion_agrees_with_the_library(q: tuple[float, float, float, float]
     assert same == pytest.approx(1.0, abs=1e-4)
 
 
-def test_yaw_of_streamed_commands_is_in_degrees() -> None:
-    header = SimpleNamespace(frame_id="/world")
-    message = SimpleNamespace(header=header, x=1.0, y=2.0, z=0.5, yaw=90.0)
-    assert of_message(commands.POSITION, message).arguments == pytest.approx((1.0, 2.0, 0.5, 90.0))
-    message = SimpleNamespace(header=header, vel=SimpleNamespace(x=0.1, y=0.0, z=0.0), yaw_rate=45.0)
-    assert of_message(commands.VELOCITY_WORLD, message).arguments == pytest.approx((0.1, 0.0, 0.0, 45.0))
-    assert of_message(commands.VELOCITY_WORLD, message).stamp == 7.0
-
-
-def of_message(kind: str, message: object) -> commands.Setpoint:
+def of_message(kind: str, **fields: object) -> commands.Setpoint:
+    """What a message in the world becomes, unless its fields say otherwise."""
+    message = SimpleNamespace(**({"header": SimpleNamespace(frame_id="world")} | fields))
     return commands.of_message(kind, message, (0.0, 0.0, 0.95), 7.0)
+
+
+def point(x: float = 0.0, y: float = 0.0, z: float = 0.0, **w: float) -> SimpleNamespace:
+    return SimpleNamespace(x=x, y=y, z=z, **w)
+
+
+def full_state(
+    place: Any = (), velocity: Any = (), acceleration: Any = (), rates: Any = (), q: Any = LEVEL, **more: Any
+):
+    pose = SimpleNamespace(position=point(*place), orientation=point(*q[:3], w=q[3]))
+    twist = SimpleNamespace(linear=point(*velocity), angular=point(*rates))
+    return of_message(commands.FULL_STATE, pose=pose, twist=twist, acc=point(*acceleration), **more)
+
+
+def test_yaw_of_streamed_commands_is_in_degrees() -> None:
+    position = of_message(commands.POSITION, x=1.0, y=2.0, z=0.5, yaw=90.0)
+    assert (position.arguments, position.place) == ((1.0, 2.0, 0.5, 90.0), (1.0, 2.0, 0.5))
+    velocity = of_message(commands.VELOCITY_WORLD, vel=point(0.3, -0.4), yaw_rate=45.0)
+    assert (velocity.arguments, velocity.stamp, velocity.speed) == ((0.3, -0.4, 0.0, 45.0), 7.0, 0.5)
+    assert (velocity.place, full_state((1.0,), (0.0, 9.0)).speed) == (None, 9.0)
 
 
 @pytest.mark.parametrize(("frame", "height"), [("map", 1.45), ("world", 0.5), ("", 0.5), ("/world", 0.5)])
 def test_places_are_in_the_world_unless_the_header_says_map(frame: str, height: float) -> None:
-    def vector(**values: float) -> SimpleNamespace:
-        return SimpleNamespace(**({"x": 0.0, "y": 0.0, "z": 0.0} | values))
-
-    pose = SimpleNamespace(position=vector(x=1.0, z=0.5), orientation=vector(w=1.0))
-    twist = SimpleNamespace(linear=vector(x=0.3), angular=vector(x=0.1, y=0.2, z=0.3))
-    message = SimpleNamespace(header=SimpleNamespace(frame_id=frame), pose=pose, twist=twist, acc=vector(z=1.0))
-    place, _, _, _, *rates = of_message(commands.FULL_STATE, message).arguments
-    assert place == (1.0, 0.0, height)
+    header = SimpleNamespace(frame_id=frame)
+    setpoint = full_state((1.0, 0.0, 0.5), (0.3,), (0.0, 0.0, 1.0), (0.1, 0.2, 0.3), header=header)
+    place, _, _, _, *rates = setpoint.arguments
+    assert (place, setpoint.place) == ((1.0, 0.0, height), (1.0, 0.0, height))
     assert rates == [0.1, 0.2, 0.3]  # rad/s
 
 
 def test_full_state_is_in_rad_per_second_and_never_overflows() -> None:
-    setpoint = commands.full_state(
-        (40.0, -40.0, 1.0), (1.0, 2.0, 3.0), (0.0, 0.0, 9.0), (0, 0, 2.0, 0), (0.1, 99.0, -0.2), 0
-    )
+    setpoint = full_state((40.0, -40.0, 1.0), (1.0, 2.0, 3.0), (0.0, 0.0, 9.0), (0.1, 99.0, -0.2), (0, 0, 2.0, 0))
     vectors = (32.767, -32.767, 1.0), (1.0, 2.0, 3.0), (0.0, 0.0, 9.0), (0, 0, 1.0, 0)
     assert setpoint.arguments == (*vectors, 0.1, 32.767, -0.2)
 
 
 def test_full_state_without_attitude_means_level() -> None:
-    zero = (0.0, 0.0, 0.0)
-    assert commands.full_state(zero, zero, zero, (0.0, 0.0, 0.0, 0.0), zero, 0.0).arguments[3] == LEVEL
+    assert full_state(q=(0.0, 0.0, 0.0, 0.0)).arguments[3] == LEVEL
 
 
 @settings(deadline=None)
 @given(vectors, vectors, vectors, vectors)
-def test_every_full_state_fits_its_packet(p, v, a, w) -> None:  # type: ignore[no-untyped-def]
+def test_every_full_state_fits_its_packet(p: Any, v: Any, a: Any, w: Any) -> None:
     commander = pytest.importorskip("cflib.crazyflie.commander")
-
-    class Radio:
-        packet = None
-
-        def send_packet(self, packet: object) -> None:
-            self.packet = packet
-
-    radio = Radio()
-    commander.Commander(radio).send_full_state_setpoint(
-        *commands.full_state(p, v, a, (0.0, 0.0, 0.0, 1.0), w, 0.0).arguments
+    packets: list[Any] = []
+    commander.Commander(SimpleNamespace(send_packet=packets.append)).send_full_state_setpoint(
+        *full_state(p, v, a, w).arguments
     )
-    kind, x, y, z, *_ = struct.unpack("<B9hI3h", bytes(radio.packet.data))  # type: ignore[attr-defined]
+    kind, x, y, z, *_ = struct.unpack("<B9hI3h", bytes(packets[0].data))
     assert kind == 6
     for sent, wanted in zip((x, y, z), p, strict=True):
         assert sent / 1000 == pytest.approx(max(-32.767, min(32.767, wanted)), abs=0.0011)
@@ -129,9 +129,11 @@ def test_every_full_state_fits_its_packet(p, v, a, w) -> None:  # type: ignore[n
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_numbers_that_are_not_finite_are_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="finite"):
-        commands.velocity_world((0.0, bad, 0.0), 0.0, 0.0)
+        of_message(commands.VELOCITY_WORLD, vel=point(0.0, bad), yaw_rate=0.0)
     with pytest.raises(ValueError, match="finite"):
-        commands.position((0.0, 0.0, 0.0), bad, 0.0)
+        of_message(commands.POSITION, x=0.0, y=0.0, z=0.0, yaw=bad)
+    with pytest.raises(ValueError, match="finite"):
+        full_state(rates=(0.0, bad))
 
 
 def test_map_is_the_middle_of_the_room_and_world_is_the_floor() -> None:

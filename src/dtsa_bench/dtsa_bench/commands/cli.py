@@ -13,10 +13,11 @@ from typing import Any, NoReturn
 from dtsa_bench import __version__
 from dtsa_bench.runs.program import program
 
-from .registry import COMMANDS, Command, hint, load_command, report_missing_package
+from .registry import COMMANDS, INTERRUPTED, Command, hint, load_command, report_missing_package
 
 PROGRAM = "dtsa"
-INTERRUPTED = 128 + signal.SIGINT
+# What `tools/dtsa` knows besides the commands of this package; a test compares.
+CHECKOUT_COMMANDS = ("setup", "shell", "test", "ros2", "clean")
 
 
 class HelpText(argparse.HelpFormatter):
@@ -132,10 +133,6 @@ def _report_system(error: OSError) -> int:
     return 1
 
 
-# What `tools/dtsa` knows besides the commands of this package; a test compares.
-CHECKOUT_COMMANDS = ("setup", "shell", "test", "ros2", "clean")
-
-
 class CompletionCommand(Command):
     description = """\
 Prints a script for bash or zsh that completes the commands of this program, their options, and the values of
@@ -145,8 +142,7 @@ options that have names. It asks nobody while one types; after an update it is m
         ("zsh > ~/.zsh/_dtsa", "then, in ~/.zshrc before compinit: fpath=(~/.zsh $fpath)"),
     )
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("shell", choices=("bash", "zsh"), help="for which shell")
+    options = (("shell", "for which shell", {"choices": ("bash", "zsh")}),)
 
     def run(self, args: argparse.Namespace) -> int:
         """Print the script."""

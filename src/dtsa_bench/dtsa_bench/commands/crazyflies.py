@@ -11,10 +11,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .registry import Command
+from .registry import Command, add_rows
 
 if TYPE_CHECKING:
     from dtsa_agent.core import SwarmConfig
+
+
+FILE, ALL = "file", "all"  # of bridge --check
+PROTOCOL = "protocol"  # app of peer-lab, and its settings
+_OF_PROTOCOL = ("policy", "slot_ms", "moving", "auth_session")
+_SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "radius_m", "channel", "rate")
 
 
 class BridgeCommand(Command):
@@ -28,27 +34,18 @@ The first Ctrl-C lands all, the second stops all motors."""
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--config", type=Path, help="swarm.yaml: robots, types, defaults, station")
-        parser.add_argument(
-            "--places",
-            metavar="N",
-            help="print a swarm.yaml for a mission of N on one dongle: places and rates; and end",
-        )
-        parser.add_argument(
-            "--backend",
-            choices=("cflib", "sim"),
-            default="cflib",
-            help="cflib: the Crazyflies of the file; sim: simulated ones in their place (default %(default)s)",
-        )
+        add_rows(parser, (
+            ("--config CONFIG", "swarm.yaml: robots, types, defaults, station", {"type": Path}),
+            ("--places N", "print a swarm.yaml for a mission of N on one dongle: places and rates; and end"),
+            ("--backend", "cflib: the Crazyflies of the file; sim: simulated ones in their place (default %(default)s)",
+             {"choices": ("cflib", "sim"), "default": "cflib"}),
+        ))  # fmt: skip
         add_simulated_radio(parser)
-        parser.add_argument(
-            "--check",
-            nargs="?",
-            const=ALL,
-            choices=(FILE, ALL),
-            help="connect, list what a flight needs (links, firmware, batteries, positions, clocks, geofence, budget, "
-            "priority), and end; exit code 1 if something is missing. file: the file and the budget alone",
-        )
+        add_rows(parser, (
+            ("--check", "connect, list what a flight needs (links, firmware, batteries, positions, clocks, geofence, "
+             "budget, priority), and end; exit code 1 if something is missing. file: the file and the budget alone",
+             {"nargs": "?", "const": ALL, "choices": (FILE, ALL)}),
+        ))  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Run the bridge until Ctrl-C."""
@@ -79,17 +76,10 @@ The first Ctrl-C lands all, the second stops all motors."""
             return run_bridge(config, check=args.check == ALL)
 
 
-FILE, ALL = "file", "all"
-
-
 def add_simulated_radio(parser: argparse._ActionsContainer) -> None:
     """Add the option that puts simulated Crazyradios in the place of real ones."""
-    parser.add_argument(
-        "--simulated-radio",
-        type=Path,
-        metavar="SOCKET",
-        help="simulation only: radio:// goes to the Crazyradios of `fake-crazyflie --simulated-radio SOCKET`",
-    )
+    text = "simulation only: radio:// goes to the Crazyradios of `fake-crazyflie --simulated-radio SOCKET`"
+    parser.add_argument("--simulated-radio", type=Path, metavar="SOCKET", help=text)
 
 
 def use_simulated_radio(args: argparse.Namespace) -> None:
@@ -113,10 +103,7 @@ def run_bridge(config: Path, *, check: bool = False) -> int:
 
 
 def simulated(config: Path, stack: ExitStack) -> Path:
-    """Start simulated Crazyflies in place of a file's real ones.
-
-    :param config: the swarm's YAML.
-    """
+    """Start simulated Crazyflies in place of the real ones of a swarm's YAML; returns the file that names them."""
     import yaml
 
     from dtsa_agent.crazyflie.settings import load_swarm
@@ -182,27 +169,24 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
 
         parser.add_argument("app", metavar="APP", help="directory of the app, or the name of one that comes with it")
         for name in _OF_PROTOCOL:
-            text = (
-                "frames are sealed, the key is in DTSA_AUTH_KEY" if name == "auth_session" else "as for `dtsa simulate`"
-            )
+            sealed = name == "auth_session"
+            text = "frames are sealed, the key is in DTSA_AUTH_KEY" if sealed else "as for `dtsa simulate`"
             parser.add_argument(f"--{name.replace('_', '-')}", metavar="X", help=f"with {PROTOCOL}: {text}")
         parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="virtual time [60]")
         add_options(parser, LabSettings, "lab", skip={spec.name for spec in settings_of(LabSettings)} - set(_SETTINGS))
-        parser.add_argument("--source", action="append", default=[], metavar="FILE", help="a further C file of the app")
-        parser.add_argument(
-            "--include", action="append", default=[], metavar="DIR", help="a further directory of headers"
-        )
-        parser.add_argument(
-            "--flag", action="append", default=[], metavar="F", help="a flag for the compiler: --flag=-O0"
-        )
-        parser.add_argument("--set", action="append", default=[], metavar="NAME=X", help="a parameter of the app")
-        parser.add_argument("--out", metavar="DIR", help="directory for summary.json, packets.jsonl and truth.jsonl")
-        parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+        add_rows(parser, (
+            ("--source FILE", "a further C file of the app", {"action": "append", "default": []}),
+            ("--include DIR", "a further directory of headers", {"action": "append", "default": []}),
+            ("--flag F", "a flag for the compiler: --flag=-O0", {"action": "append", "default": []}),
+            ("--set NAME=X", "a parameter of the app", {"action": "append", "default": []}),
+            ("--out DIR", "directory for summary.json, packets.jsonl and truth.jsonl"),
+            ("--json", "print summary.json instead of lines"),
+        ))  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Fly and print what came of it."""
         from dtsa_agent.core.errors import ConfigError
-        from dtsa_bench.crazyflies.peer_lab.app import LabSettings
+        from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
         from dtsa_bench.crazyflies.peer_lab.process import fly
         from dtsa_bench.runs.options import given_options, new_directory
 
@@ -214,30 +198,24 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
         swarm, place = None, args.app
         of_protocol = {name: getattr(args, name) for name in _OF_PROTOCOL if getattr(args, name) is not None}
         if args.app == PROTOCOL:
-            swarm, place = _swarm(of_protocol, settings), _folder()
+            from dtsa_bench.crazyflies.peer_lab.onboard import APP
+
+            swarm, place = _swarm(of_protocol, settings), str(APP)
         elif of_protocol:
             name, value = next(iter(of_protocol.items()))
             raise ConfigError(name, value, f"only with {PROTOCOL}")
-        summary = fly(
-            place, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
-            flags=tuple(args.flag), parameters=parameters, out=out, swarm=swarm,
-        )  # fmt: skip
+        app = read_app(place, sources=tuple(args.source), include=tuple(args.include), flags=tuple(args.flag))
+        summary = fly(app, args.seconds, settings, parameters=parameters, out=out, swarm=swarm)
         console, warnings, logs = (summary.pop(key) for key in ("console", "warnings", "logs"))
         if out is not None:
-            _write(out, {**summary, "logs": logs}, console)
+            text = json.dumps({**summary, "logs": logs}, indent=2) + "\n"
+            (out / "summary.json").write_text(text, encoding="utf-8")
+            lines = (f"{time:.6f} {agent} {line}\n" for time, agent, line in console)
+            (out / "console.txt").write_text("".join(lines), encoding="utf-8")
         if warnings:
             print(warnings, end="", file=sys.stderr)
         print(json.dumps(summary, indent=2) if args.json else _lines(summary, len(console)))
         return 0
-
-
-PROTOCOL = "protocol"
-
-
-_OF_PROTOCOL = ("policy", "slot_ms", "moving", "auth_session")
-
-
-_SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "radius_m", "channel", "rate")
 
 
 def _swarm(options: dict[str, str], settings: Any) -> SwarmConfig:
@@ -255,12 +233,6 @@ def _swarm(options: dict[str, str], settings: Any) -> SwarmConfig:
     return swarm
 
 
-def _folder() -> str:
-    from dtsa_bench.crazyflies.peer_lab.onboard import APP
-
-    return str(APP)
-
-
 def _parameter(text: str) -> tuple[str, float]:
     from dtsa_agent.core.errors import ConfigError
 
@@ -269,12 +241,6 @@ def _parameter(text: str) -> tuple[str, float]:
         return name, float(value)
     except ValueError:
         raise ConfigError("set", text, "GROUP.NAME=NUMBER") from None
-
-
-def _write(out: Path, summary: dict[str, Any], console: list[Any]) -> None:
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    lines = (f"{time:.6f} {agent} {line}\n" for time, agent, line in console)
-    (out / "console.txt").write_text("".join(lines), encoding="utf-8")
 
 
 def _lines(summary: dict[str, Any], printed: int) -> str:

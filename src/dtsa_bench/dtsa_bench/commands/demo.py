@@ -16,10 +16,14 @@ from typing import TYPE_CHECKING, Any
 from dtsa_bench.runs.options import new_directory, whole_number
 from dtsa_bench.runs.program import program
 
-from .registry import Command
+from .registry import INTERRUPTED, Command, warn
 
 if TYPE_CHECKING:
     from dtsa_bench.pages.demo.flights import FinishedFlight
+
+
+NUMBERS = "demo.json"
+_REMOTE = ("SSH_CONNECTION", "SSH_CLIENT", "SSH_TTY", "CI")
 
 
 class DemoCommand(Command):
@@ -32,29 +36,17 @@ every machine, stand side by side on a page; in the last one, in real time, a pr
         ("--animation --no-open --out story", "with a moving picture; no browser"),
     )
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument(
-            "--out", metavar="DIR", default=None, help="new directory for everything [runs/demo-1, -2, ...]"
-        )
-        parser.add_argument("--seed", metavar="N", default="1", help="seed of the flights [1]")
-        parser.add_argument(
-            "--animation", action="store_true", help="make demo.gif, too, a moving picture of steps 2 and 3"
-        )
-        parser.add_argument(
-            "--json", action="store_true", help="print demo.json; everything else goes to standard error"
-        )
-        parser.add_argument(
-            "--open",
-            action=argparse.BooleanOptionalAction,
-            default=None,
-            help="open the page in a browser [where there is a display, but not over ssh or in CI]",
-        )
+    options = (
+        ("--out DIR", "new directory for everything [runs/demo-1, -2, ...]"),
+        ("--seed N", "seed of the flights [1]", {"default": "1"}),
+        ("--animation", "make demo.gif, too, a moving picture of steps 2 and 3"),
+        ("--json", "print demo.json; everything else goes to standard error"),
+        ("--open", "open the page in a browser [where there is a display, but not over ssh or in CI]",
+         {"action": argparse.BooleanOptionalAction, "default": None}),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
-        """Flies, checks, draws.
-
-        :returns: 0; 1 if a bag's check failed; 130 when interrupted.
-        """
+        """Fly, check, draw; 1 if a bag's check failed, 130 when interrupted."""
         if args.json:
             with redirect_stdout(sys.stderr):
                 code, directory = _run(args)
@@ -62,15 +54,6 @@ every machine, stand side by side on a page; in the last one, in real time, a pr
                 print((directory / NUMBERS).read_text(encoding="utf-8"), end="")
             return code
         return _run(args)[0]
-
-
-INTERRUPTED = 130
-
-
-NUMBERS = "demo.json"
-
-
-_REMOTE = ("SSH_CONNECTION", "SSH_CLIENT", "SSH_TTY", "CI")
 
 
 def _run(args: argparse.Namespace) -> tuple[int, Path]:
@@ -84,6 +67,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
 
     clear_hindrances(os.environ)
     from dtsa_agent.stop import Stop
+    from dtsa_bench.experiments.tables import aligned
     from dtsa_bench.pages.demo.flights import HEAD, demo_steps, fly_all, table_rows
     from dtsa_bench.pages.report.data import write_report
 
@@ -93,7 +77,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
     with Stop() as stop:
         flights = fly_all(steps, directory, stop)
     if stop:
-        print(f"dtsa: the demo was interrupted; what was flown is in {directory}", file=sys.stderr)
+        warn(f"the demo was interrupted; what was flown is in {directory}")
         return INTERRUPTED, directory
     good = [_is_verified(key, directory / key) for key in flights]
     numbers = {key: dict(finished.summary) for key, finished in flights.items()}
@@ -102,7 +86,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
     _draw(steps, flights, directory, args.animation)
     compared = [directory / key for key, finished in flights.items() if not finished.flight.live]
     page = write_report(compared, directory / "demo.html")
-    print("\n" + aligned([HEAD, *table_rows(steps, flights)]) + "\n")
+    print("\n" + aligned([HEAD, *table_rows(steps, flights)], rule=True) + "\n")
     print(f"picture    {directory / 'demo.png'}\nflights    {directory}/{{{','.join(flights)}}}")
     for text, command in _next_commands(directory):
         print(f"{text:44} {command}")
@@ -136,15 +120,6 @@ def _draw(steps: Any, flights: Mapping[str, FinishedFlight], directory: Path, an
             from dtsa_bench.pages.demo.picture import draw_animation
 
             draw_animation(directory / "demo.gif", flights)
-
-
-def aligned(rows: list[list[str]]) -> str:
-    """Rows of cells in columns, with a rule below the first."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows = [rows[0], ["-" * width for width in widths], *rows[1:]]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
 
 
 def _next_commands(directory: Path) -> list[tuple[str, str]]:

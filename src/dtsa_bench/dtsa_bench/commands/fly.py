@@ -13,7 +13,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import settings_of
+from dtsa_agent.stop import Stop
 from dtsa_bench.flights.options import FlightOptions
 from dtsa_bench.runs.options import (
     add_mode_options,
@@ -22,13 +24,17 @@ from dtsa_bench.runs.options import (
     given_options,
     run_config,
     whole_number,
-)
+)  # fmt: skip
 
 from .crazyflies import add_simulated_radio, use_simulated_radio
-from .registry import Command
+from .registry import INTERRUPTED, Command, add_rows, warn
 
 if TYPE_CHECKING:
     from dtsa_bench.pages.view.process import PageOptions
+
+
+LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
+_LATER = ("respawn",)  # options of a flight that concern real time alone
 
 
 class FlyCommand(Command):
@@ -45,49 +51,31 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.usage = "%(prog)s --out DIR [OPTIONS]"
         group = parser.add_argument_group("the flight")
-        group.add_argument(
-            "--out", metavar="DIR", required=True, help="new directory for the bag, summary.json and trajectories.png"
-        )
-        group.add_argument(
-            "--processes",
-            metavar="per-agent|K",
-            default="per-agent",
-            help="one process an agent, or all agents in K processes [per-agent]",
-        )
-        group.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the flight [a free one]")
-        group.add_argument(
-            "--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png"
-        )
-        group.add_argument("--json", action="store_true", help="print summary.json instead of lines")
-        group.add_argument(
-            "--view", action="store_true", help="show the flight in a browser on this machine, see docs/how-to/view.md"
-        )
-        group.add_argument("--view-port", metavar="N", default=None, help="port of the page [a free one]")
-        group.add_argument(
-            "--control",
-            action="store_true",
-            help="the page may kill and start agents and change the channel; land and stop Crazyflies",
-        )
+        add_rows(group, (
+            ("--out DIR", "new directory for the bag, summary.json and trajectories.png", {"required": True}),
+            ("--processes per-agent|K", "one process an agent, or all agents in K processes [per-agent]",
+             {"default": "per-agent"}),
+            ("--domain N", "ROS_DOMAIN_ID of the flight [a free one]"),
+            ("--picture", "draw trajectories.png", {"action": argparse.BooleanOptionalAction, "default": True}),
+            ("--json", "print summary.json instead of lines"),
+            ("--view", "show the flight in a browser on this machine, see docs/how-to/view.md"),
+            ("--view-port N", "port of the page [a free one]"),
+            ("--control", "the page may kill and start agents and change the channel; land and stop Crazyflies"),
+        ))  # fmt: skip
         add_options(group, FlightOptions, "flight", skip=(*_LATER, "startup_s", "processes", "domain", "pictures"))
         _add_crazyflie_options(parser)
         add_run_options(parser)
         clocks = add_mode_options(parser)
         kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
         add_options(clocks, FlightOptions, "flight", skip=kept)
-        clocks.add_argument(
-            "--late",
-            metavar="cfK=S,...",
-            default=None,
-            help="real time: agents whose processes are started S seconds after slot 0 only [none]",
-        )
+        text = "real time: agents whose processes are started S seconds after slot 0 only [none]"
+        clocks.add_argument("--late", metavar="cfK=S,...", help=text)
 
     def run(self, args: argparse.Namespace) -> int:
         """Flies; 1 when the flight was cut short or its agents did not hear each other, 130 when it was interrupted."""
         if args.backend == "cflib":
             return run_crazyflies(args)
         config = run_config(args)
-        from dtsa_agent.core.errors import ConfigError
-
         if args.config is not None:
             raise ConfigError("config", args.config, "a swarm.yaml together with --backend cflib")
         domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
@@ -96,17 +84,13 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
         from dtsa_bench.flights.domain import clear_hindrances
 
         clear_hindrances(os.environ)
-        from dtsa_agent.stop import Stop
         from dtsa_bench.flights.flight import fly
         from dtsa_bench.flights.options import process_count
 
         options = FlightOptions(
-            processes=process_count(args.processes, config.swarm.agents),
-            domain=domain,
-            pictures=args.picture,
-            late=late_agents(args.late),
-            **given_options(args, FlightOptions, "flight"),
-        )
+            processes=process_count(args.processes, config.swarm.agents), domain=domain, pictures=args.picture,
+            late=late_agents(args.late), **given_options(args, FlightOptions, "flight"),
+        )  # fmt: skip
         page = page_options(args)
         with Stop(LONGEST_END_S) as stop, ExitStack() as pages:
             process = None
@@ -129,44 +113,29 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
                 while not stop and process.poll() is None:
                     time.sleep(0.1)
         if flight.summary.get("warning"):
-            print(f"dtsa: warning: {flight.summary['warning']}", file=sys.stderr)
+            warn(f"warning: {flight.summary['warning']}")
         cut_short = flight.summary.get("cut_short")
         if interrupted:
-            print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
+            warn("the flight was interrupted; its bag is complete up to that point")
             _report_missing_frames(flight.summary)
             return INTERRUPTED
         if cut_short:
-            print(f"dtsa: the flight was cut short: {cut_short}", file=sys.stderr)
+            warn(f"the flight was cut short: {cut_short}")
         return 1 if _report_missing_frames(flight.summary) or cut_short else 0
-
-
-INTERRUPTED = 130
-
-
-LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
-
-
-_LATER = ("respawn",)  # options of a flight that concern real time alone
 
 
 def _add_crazyflie_options(parser: argparse.ArgumentParser) -> None:
     crazyflies = parser.add_argument_group("Crazyflies")
-    crazyflies.add_argument(
-        "--backend",
-        choices=("sim", "cflib"),
-        default="sim",
-        help="cflib: the Crazyflies of --config, in real time [sim]",
-    )
-    crazyflies.add_argument(
-        "--config", metavar="FILE", default=None, help="swarm.yaml of the Crazyflies, for --backend cflib"
-    )
+    add_rows(crazyflies, (
+        ("--backend", "cflib: the Crazyflies of --config, in real time [sim]",
+         {"choices": ("sim", "cflib"), "default": "sim"}),
+        ("--config FILE", "swarm.yaml of the Crazyflies, for --backend cflib"),
+    ))  # fmt: skip
     add_simulated_radio(crazyflies)
-    crazyflies.add_argument(
-        "--attach",
-        action="store_true",
-        help="by the bridge that runs already (dtsa bridge) on the ROS domain of --domain or ROS_DOMAIN_ID, and goes "
-        "on: for several missions in a row",
-    )
+    add_rows(crazyflies, (
+        ("--attach", "by the bridge that runs already (dtsa bridge) on the ROS domain of --domain or ROS_DOMAIN_ID, "
+         "and goes on: for several missions in a row"),
+    ))  # fmt: skip
 
 
 def page_options(args: argparse.Namespace) -> PageOptions | None:
@@ -179,16 +148,11 @@ def page_options(args: argparse.Namespace) -> PageOptions | None:
 
 
 def late_agents(text: str | None) -> dict[int, float]:
-    """Seconds by agent, from ``cf5=3,cf6=4.5``.
-
-    :raises ConfigError: if the text is none of that kind.
-    """
+    """Seconds by agent, from ``cf5=3,cf6=4.5``."""
     late = {}
     for part in () if text is None else text.split(","):
         match = re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part)
         if not match:
-            from dtsa_agent.core.errors import ConfigError
-
             raise ConfigError("late", text, "cfK=S,...: agents, and seconds after slot 0")
         late[int(match[1])] = float(match[2])
     return late
@@ -196,7 +160,6 @@ def late_agents(text: str | None) -> dict[int, float]:
 
 def run_crazyflies(args: argparse.Namespace) -> int:
     """A mission; 1 when a vehicle cut the exchange short or agents did not hear each other, 130 when interrupted."""
-    from dtsa_agent.core.errors import ConfigError
     from dtsa_agent.crazyflie.settings import load_swarm
 
     if args.config is None:
@@ -204,7 +167,6 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     use_simulated_radio(args)
     path = Path(args.config)
     settings = load_swarm(path)
-    from dtsa_agent.stop import Stop
     from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
     from dtsa_bench.crazyflies.missions.places import mission_defaults
 
@@ -223,16 +185,13 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     unheard = _report_missing_frames(flight.summary)
     not_landed = [] if stop and not cut_short else flight.summary.get("not_landed", [])
     if problem := mission_problem(cut_short, not_landed):
-        print(f"dtsa: {problem}", file=sys.stderr)
+        warn(problem)
         return 1
     return INTERRUPTED if stop else int(unheard)
 
 
 def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
-    """What went wrong in a mission; empty: nothing.
-
-    :param cut_short: why the exchange was; empty: it was not.
-    """
+    """What went wrong in a mission; empty: nothing. ``cut_short``: why the exchange was, if it was."""
     if not (cut_short or not_landed):
         return ""
     exchange = f"the exchange was cut short: {cut_short}" if cut_short else "the exchange is complete"
@@ -243,7 +202,7 @@ def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
 def _report_missing_frames(summary: dict[str, Any]) -> bool:
     """Warn if no agent has heard another one, or most frames were of no use; whether it is so."""
     if summary["unheard"]:
-        print(f"dtsa: {summary['unheard']}", file=sys.stderr)
+        warn(summary["unheard"])
     return bool(summary["unheard"])
 
 
@@ -258,28 +217,21 @@ def _print_result(args: argparse.Namespace, flight: Any) -> None:
 
 def describe(summary: dict[str, Any]) -> str:
     """A flight's results in a few lines."""
-    slots = summary["slots"]
     end = summary["end"]
     arrived = "" if summary["completion_time_s"] is None else f" after {summary['completion_time_s']:.2f} s"
     if summary["collided"]:
         end = "crashed (cf{} and cf{})".format(*summary["collided_pair"])
     elif end == "completed":
         end += arrived
-    lines = [
-        f"{summary['agents']} agents, {summary['moving']} moving, {summary['policy']}, {summary['estimator']}, "
-        f"{summary['avoider']}: {end}"
-    ]
+    what = "{agents} agents, {moving} moving, {policy}, {estimator}, {avoider}".format(**summary)
+    lines = [f"{what}: {end}"]
     if summary["collided"] and arrived:
         lines.append(f"all were at their targets{arrived}")
-    parts = [
-        f"slots {slots['total']} (success {slots['success']}, collision {slots['collision']}, idle {slots['idle']})"
-    ]
+    parts = ["slots {total} (success {success}, collision {collision}, idle {idle})".format(**summary["slots"])]
     for name, key, form in (
-        ("closest", "min_distance_m", "{:.3f} m"),
-        ("efficiency", "efficiency_mean", "{:.3f}"),
-        ("mean age", "age_mean_slots", "{:.2f} slots"),
-        ("real-time factor", "realtime_factor", "{:.2f}"),
-    ):
+        ("closest", "min_distance_m", "{:.3f} m"), ("efficiency", "efficiency_mean", "{:.3f}"),
+        ("mean age", "age_mean_slots", "{:.2f} slots"), ("real-time factor", "realtime_factor", "{:.2f}"),
+    ):  # fmt: skip
         if summary[key] is not None:
             parts.append(f"{name} {form.format(summary[key])}")
     return "\n".join([*lines, ", ".join(parts)])

@@ -9,14 +9,30 @@ import secrets
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.experiments.batch import run_in
+from dtsa_bench.experiments.league import (
+    HEADS,
+    STAR,
+    League,
+    LeagueTable,
+    batch_of,
+    check_entry,
+    flight_of,
+    league,
+    make_entry,
+    read_entries,
+    write_entries,
+)  # fmt: skip
+from dtsa_bench.experiments.tables import aligned
+from dtsa_bench.runs.options import named_values, processes, whole_number
 from dtsa_bench.runs.program import program
 
-from .registry import Command
+from .registry import Command, add_rows, warn
 
-if TYPE_CHECKING:
-    from dtsa_bench.experiments.league import League
+SAMPLE = 24  # flights of an entry that `check` flies again
+_SHOWN = 10  # differences that are named; the others are counted
 
 
 class LeagueCommand(Command):
@@ -36,62 +52,48 @@ what differs. `table FILE...` compares entries. How to enter: docs/how-to/sweep.
         actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
         actions.add_parser("cells", help="list what is flown")
         enter = actions.add_parser("enter", help="fly a policy through all cells")
-        enter.add_argument("policy", metavar="POLICY", help="a scheme of `league cells`, or a policy by its name")
-        enter.add_argument("--name", metavar="NAME", help="name of the entry [the scheme's]")
-        enter.add_argument(
-            "--set", metavar="NAME=VALUE", action="append", help="a setting of the policy, or frame=extended"
-        )
-        enter.add_argument("--cells", metavar="NAME[,NAME...]", help="these alone; the entry is incomplete")
-        enter.add_argument("--sample", metavar="N", help="so many seeds of each cell; the entry is incomplete")
-        enter.add_argument("--cluster", metavar="tcp://HOST:PORT", help="fly on a Dask cluster with this scheduler")
-        enter.add_argument("--out", metavar="DIR", help="directory for entry.json [runs/league-1/NAME]")
+        add_rows(enter, (
+            ("policy POLICY", "a scheme of `league cells`, or a policy by its name"),
+            ("--name NAME", "name of the entry [the scheme's]"),
+            ("--set NAME=VALUE", "a setting of the policy, or frame=extended", {"action": "append"}),
+            ("--cells NAME[,NAME...]", "these alone; the entry is incomplete"),
+            ("--sample N", "so many seeds of each cell; the entry is incomplete"),
+            ("--cluster tcp://HOST:PORT", "fly on a Dask cluster with this scheduler"),
+            ("--out DIR", "directory for entry.json [runs/league-1/NAME]"),
+        ))  # fmt: skip
         check = actions.add_parser("check", help="fly a sample of entries again")
-        check.add_argument("file", metavar="FILE", help="file of entries, or directory that `enter` wrote")
-        check.add_argument("names", metavar="NAME", nargs="*", help="which of its entries [all]")
-        check.add_argument("--sample", metavar="N", default=str(SAMPLE), help=f"so many flights of each [{SAMPLE}]")
-        check.add_argument("--all", action="store_true", help="all flights")
-        check.add_argument("--seed", metavar="N", help="which flights are flown again [at random]")
+        add_rows(check, (
+            ("file FILE", "file of entries, or directory that `enter` wrote"),
+            ("names NAME*", "which of its entries [all]"),
+            ("--sample N", f"so many flights of each [{SAMPLE}]", {"default": str(SAMPLE)}),
+            ("--all", "all flights"),
+            ("--seed N", "which flights are flown again [at random]"),
+        ))  # fmt: skip
         for action in (enter, check):
             action.add_argument("--path", metavar="DIR", help="where Python also looks for installed plug-ins")
             action.add_argument("--jobs", metavar="N", help="processes [all cores]")
         table = actions.add_parser("table", help="compare entries")
-        table.add_argument(
-            "files", metavar="FILE", nargs="+", help="files of entries, or directories that `enter` wrote"
-        )
-        table.add_argument("--out", metavar="DIR", help="directory for the page and its figure [runs/league-1/table]")
-        table.add_argument("--json", action="store_true", help="print the table as JSON")
+        add_rows(table, (
+            ("files FILE...", "files of entries, or directories that `enter` wrote"),
+            ("--out DIR", "directory for the page and its figure [runs/league-1/table]"),
+            ("--json", "print the table as JSON"),
+        ))  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Do one of the actions."""
-        from dtsa_bench.experiments.league import league
-
         if getattr(args, "path", None):
             sys.path.insert(0, str(Path(args.path).resolve()))
             importlib.invalidate_caches()
         return {"cells": _cells, "enter": _enter, "check": _check, "table": _table}[args.action](args, league())
 
 
-SAMPLE = 24  # flights of an entry that `check` flies again
-
-
-_SHOWN = 10  # differences that are named; the others are counted
-
-
 def _cells(args: argparse.Namespace, the_league: League) -> int:
-    from dtsa_bench.experiments.tables import aligned
-
     print(aligned([["cell", "what it is"], *([name, cell["text"]] for name, cell in the_league.cells.items())]))
     print(f"\n{the_league.seed_count} seeds each\nschemes: {', '.join(the_league.entrants)}")
     return 0
 
 
 def _enter(args: argparse.Namespace, the_league: League) -> int:
-    from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.experiments.batch import run_in
-    from dtsa_bench.experiments.league import HEADS, LeagueTable, batch_of, flight_of, make_entry, write_entries
-    from dtsa_bench.experiments.tables import aligned
-    from dtsa_bench.runs.options import named_values, processes, whole_number
-
     cells = list(the_league.cells)
     if args.cells is not None:
         chosen = [name.strip() for name in args.cells.split(",")]
@@ -114,15 +116,11 @@ def _enter(args: argparse.Namespace, the_league: League) -> int:
     print(f"entry: {directory / 'entry.json'}" + ("" if table.complete else " (incomplete)"))
     reasons = [rows[task.key]["reason"] for task in batch.tasks if rows[task.key]["reason"]]
     if reasons:
-        print(f"dtsa: {len(reasons)} flights could not be flown: {reasons[0]}", file=sys.stderr)
+        warn(f"{len(reasons)} flights could not be flown: {reasons[0]}")
     return 1 if reasons else 0
 
 
 def _check(args: argparse.Namespace, the_league: League) -> int:
-    from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.experiments.league import check_entry, read_entries
-    from dtsa_bench.runs.options import processes, whole_number
-
     entries = {entry["name"]: entry for entry in read_entries(args.file)}
     if unknown := next((name for name in args.names if name not in entries), None):
         raise ConfigError("NAME", unknown, ", ".join(entries))
@@ -147,12 +145,9 @@ def _check(args: argparse.Namespace, the_league: League) -> int:
 
 
 def _table(args: argparse.Namespace, the_league: League) -> int:
-    from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.experiments.league import HEADS, STAR, LeagueTable, read_entries
-    from dtsa_bench.experiments.tables import aligned
+    table = LeagueTable(the_league, [entry for path in args.files for entry in read_entries(path)])
     from dtsa_bench.pages.report.tables import write_league
 
-    table = LeagueTable(the_league, [entry for path in args.files for entry in read_entries(path)])
     directory = Path(args.out or Path("runs") / the_league.name / "table")
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -174,11 +169,10 @@ best and the bound, and the lines that install and run it. What a policy is give
 returns: docs/reference/plug-ins.md."""
     examples = (("my-policy --out plugins/my-policy", "then as its README.md says"),)
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("name", metavar="NAME", help="what the policy will be called, as in my-policy")
-        parser.add_argument(
-            "--out", metavar="DIR", help="where the package goes (default: a directory of that name here)"
-        )
+    options = (
+        ("name NAME", "what the policy will be called, as in my-policy"),
+        ("--out DIR", "where the package goes (default: a directory of that name here)"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Write the package."""

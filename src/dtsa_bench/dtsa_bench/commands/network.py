@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,9 @@ from dtsa_agent.core.settings.declaration import Setting, Settings, names_with_v
 from dtsa_agent.core.station import check_joinable
 from dtsa_agent.keys import check_key, check_session
 from dtsa_agent.yaml_file import read_yaml
-from dtsa_bench.runs.options import add_options, given_options, number
+from dtsa_bench.runs.options import add_options, given_options, new_directory, number
 
-from .registry import Command
+from .registry import Command, add_rows, warn
 
 DEFAULT_POLICY = "lease"
 _NO_OPTION = ("policy", "auth", *(s.name for s in settings_of(SwarmConfig) if s.group == "Priority and selection"))
@@ -32,41 +31,33 @@ _OPTIONS = {"policy": "policy", "auth": "seal"}  # settings whose options are ca
 
 def add_results(parser: argparse.ArgumentParser) -> None:
     """Add what carries the frames, and where the results go."""
-    parser.add_argument("--air", choices=AIRS, help=f"what carries the frames [{AIRS[0]}]")
-    parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
-    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    add_rows(parser, (
+        ("--air", f"what carries the frames [{AIRS[0]}]", {"choices": AIRS}),
+        ("--out DIR", "directory for its bag and summary.json; default: only printed"),
+        ("--json", "print summary.json instead of lines"),
+    ))  # fmt: skip
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of ports and swarm, and their file. A setting that several ports have is one option."""
-    parser.add_argument(
-        "--swarm",
-        metavar="FILE",
-        dest="swarm_file",
-        help="YAML file of settings that all computers share, as `agents: 12`; options go before it",
-    )
+    text = "YAML file of settings that all computers share, as `agents: 12`; options go before it"
+    parser.add_argument("--swarm", metavar="FILE", dest="swarm_file", help=text)
     names: set[str] = set()
     for air in AIRS:
         group = parser.add_argument_group(f"what carries the frames: --air {air}")
         add_options(group, settings_class(air), "port", skip=names)
         names |= {setting.name for setting in settings_of(settings_class(air))}
-    parser.add_argument_group("authentication").add_argument(
-        "--seal",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="frames carry a code that only holders of the key can make; the key is in the environment: DTSA_AUTH_KEY "
-        "[--seal]",
-    )
+    add_rows(parser.add_argument_group("authentication"), (
+        ("--seal", "frames carry a code that only holders of the key can make; the key is in the environment: "
+         "DTSA_AUTH_KEY [--seal]", {"action": argparse.BooleanOptionalAction}),
+    ))  # fmt: skip
     swarm = parser.add_argument_group("the swarm: what all agents share")
     swarm.add_argument("--policy", metavar="NAME", help=f"policy: which agent sends next [{DEFAULT_POLICY}]")
     add_options(swarm, SwarmConfig, "swarm", skip=_NO_OPTION)
 
 
 def read_network_options(args: argparse.Namespace) -> tuple[PortSettings, SwarmConfig]:
-    """What carries the frames, and what all agents share, as options and file say; options go before the file.
-
-    :raises ConfigError: for a setting that does not exist or cannot be, or a missing key or session.
-    """
+    """What carries the frames, and what all agents share, as options and file say; options go before the file."""
     _read_file(args)
     cls = settings_class(args.air)
     specs = {setting.name: setting for setting in settings_of(cls)}
@@ -110,9 +101,8 @@ def _content(path: str) -> dict[str, Any]:
     try:
         content = read_yaml(path, "swarm")
     except ConfigError as error:
-        if error.field == "swarm":
-            raise
-        raise ConfigError(f"{error.field} in {path}", error.value, error.allowed) from None
+        field = error.field if error.field == "swarm" else f"{error.field} in {path}"
+        raise ConfigError(field, error.value, error.allowed) from None
     for section in _ROS:
         if isinstance(content, Mapping) and section in content:
             content = content[section]
@@ -136,13 +126,8 @@ environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
         add_results(parser)
         own = parser.add_argument_group("this agent")
         add_options(own, AgentSettings, "own")
-        own.add_argument(
-            "--check",
-            nargs="?",
-            const="0",
-            metavar="SECONDS",
-            help="no flight: reports which agents hear each other in time; exit code 0: all hear all [until all know]",
-        )
+        text = "no flight: reports which agents hear each other in time; exit code 0: all hear all [until all know]"
+        own.add_argument("--check", nargs="?", const="0", metavar="SECONDS", help=text)
         add_network_options(parser)
 
     def run(self, args: argparse.Namespace) -> int:
@@ -178,7 +163,6 @@ frames: then a lease that it does not know looks like a broken rule."""
         from dtsa_agent.stop import Stop
         from dtsa_bench.log.bag.errors import BagError
         from dtsa_bench.network.sniffer import Sniffer
-        from dtsa_bench.runs.options import new_directory, number
 
         from .recordings import summary_lines
 
@@ -187,10 +171,7 @@ frames: then a lease that it does not know looks like a broken rule."""
         directory = None if args.out is None else new_directory(args.out)
         path = None if directory is None else directory / "sniffed.mcap"
 
-        def report(line: str) -> None:
-            print(f"dtsa: {line}", file=sys.stderr, flush=True)
-
-        with Stop() as stop, Sniffer(config, port, path, report) as sniffer:
+        with Stop() as stop, Sniffer(config, port, path, warn) as sniffer:
             sniffer.run(stop, duration)
         summary = sniffer.summary()
         text = json.dumps(summary, indent=2) + "\n"
@@ -208,9 +189,10 @@ Topics of any robots over the shared channel: /robot1/pose comes out as /robot2/
 A YAML file names robots, topics, places and the channel. Ctrl-C ends it."""
     examples = (("examples/relay.yaml", "two talkers that lose every fifth message"),)
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("file", type=Path, help="YAML file: robots, topics, channel")
-        parser.add_argument("--use-sim-time", action="store_true", help="time is that of /clock")
+    options = (
+        ("file", "YAML file: robots, topics, channel", {"type": Path}),
+        ("--use-sim-time", "time is that of /clock"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Relay until Ctrl-C."""

@@ -12,14 +12,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from .registry import RECORDED_RUN, Command
+from .registry import RECORDED_RUN, Command, add_rows, warn
 
 if TYPE_CHECKING:
     from dtsa_bench.log.bag.replay import Player
+    from dtsa_bench.pages.view.graph import GraphSource
+    from dtsa_bench.pages.view.network_listener import NetworkListener
     from dtsa_bench.pages.view.page_commands import PageCommand
     from dtsa_bench.pages.view.server import ViewServer
+
+
+_ROS = "ros"
+_END_S = 2.0  # for the source to end, and for pages to receive the end of a flight
+_NICE = 10  # flights on this machine go first
 
 
 class ReplayCommand(Command):
@@ -32,19 +39,16 @@ Other nodes follow it with use_sim_time:=true. Keys: space pauses and goes on, q
         ("runs/a --rate 0.5 --start 2 --loop", "half as fast, from 2 s on, again and again"),
     )
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("bag", help=RECORDED_RUN)
-        parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed, 1 is real time (default 1)")
-        parser.add_argument("--start", type=float, default=0.0, metavar="S", help="begin S seconds into the run")
-        parser.add_argument("--loop", action="store_true", help="begin again at the end, until q or Ctrl-C")
-        parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play these topics only")
-        parser.add_argument(
-            "--delay", type=float, default=0.5, metavar="S",
-            help="wait S seconds before the first message, for subscribers to find the player (default 0.5)",
-        )  # fmt: skip
-        parser.add_argument(
-            "--wait-for-subscriber", action="store_true", help="begin when one of the topics has a subscriber"
-        )
+    options = (
+        ("bag", RECORDED_RUN),
+        ("--rate R", "speed, 1 is real time (default 1)", {"type": float, "default": 1.0}),
+        ("--start S", "begin S seconds into the run", {"type": float, "default": 0.0}),
+        ("--loop", "begin again at the end, until q or Ctrl-C"),
+        ("--topics TOPIC...", "play these topics only"),
+        ("--delay S", "wait S seconds before the first message, for subscribers to find the player (default 0.5)",
+         {"type": float, "default": 0.5}),
+        ("--wait-for-subscriber", "begin when one of the topics has a subscriber"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Play the bag."""
@@ -63,9 +67,7 @@ Other nodes follow it with use_sim_time:=true. Keys: space pauses and goes on, q
             init_ros(None)
             try:
                 node = rclpy.create_node("replay", enable_rosout=False, start_parameter_services=False)
-                output = RosOutput(
-                    node, topics, lambda line: print(f"dtsa: warning: {line}", file=sys.stderr, flush=True)
-                )
+                output = RosOutput(node, topics, lambda line: warn(f"warning: {line}"))
                 player = Player(bag, output, args.rate, args.start, args.loop, output.topics)
 
                 def stop(*_: object) -> None:
@@ -115,14 +117,14 @@ def keyboard() -> Iterator[Callable[[], str]]:
     import tty
 
     descriptor = sys.stdin.fileno()
+
+    def is_ready() -> bool:
+        return bool(select.select([descriptor], [], [], 0)[0])
+
     before = termios.tcgetattr(descriptor)
     try:
         tty.setcbreak(descriptor)
-        yield (
-            lambda: (
-                os.read(descriptor, 64).decode("utf-8", "replace") if select.select([descriptor], [], [], 0)[0] else ""
-            )
-        )
+        yield lambda: os.read(descriptor, 64).decode("utf-8", "replace") if is_ready() else ""
     finally:
         termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
 
@@ -142,18 +144,15 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
         parser.add_argument("bags", nargs="*", help=argparse.SUPPRESS)
         from dtsa_agent.air.port import AIRS
 
-        parser.add_argument("--air", choices=(_ROS, *AIRS), help="what carries the swarm's frames [ros]")
-        parser.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the swarm")
-        parser.add_argument("--namespace", metavar="NAME", default=None, help="namespace of the swarm [/swarm]")
-        parser.add_argument(
-            "--control",
-            action="store_true",
-            help="the page may change the channel, kill and start agents, land all Crazyflies and stop their motors",
-        )
-        parser.add_argument("--port", metavar="N", default="0", help="where the page is [a free port]")
-        parser.add_argument(
-            "--listen", metavar="ADDRESS", default=None, help="an address of this machine that others reach [127.0.0.1]"
-        )
+        add_rows(parser, (
+            ("--air", "what carries the swarm's frames [ros]", {"choices": (_ROS, *AIRS)}),
+            ("--domain N", "ROS_DOMAIN_ID of the swarm"),
+            ("--namespace NAME", "namespace of the swarm [/swarm]"),
+            ("--control", "the page may change the channel, kill and start agents, land all Crazyflies and stop their "
+             "motors"),
+            ("--port N", "where the page is [a free port]", {"default": "0"}),
+            ("--listen ADDRESS", "an address of this machine that others reach [127.0.0.1]"),
+        ))  # fmt: skip
         from .network import add_network_options
 
         add_network_options(parser)
@@ -174,7 +173,7 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
             raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
         with suppress(OSError):
             os.nice(_NICE)
-        source: Source
+        source: GraphSource | NetworkListener
         command: Callable[[PageCommand], str] | None = None
         if args.swarm_file or args.air not in (None, _ROS):
             from dtsa_bench.pages.view.network_listener import NetworkListener
@@ -197,24 +196,6 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
         return 0
 
 
-_ROS = "ros"
-
-
-_END_S = 2.0  # for the source to end, and for pages to receive the end of a flight
-
-
-_NICE = 10  # flights on this machine go first
-
-
-class Source(Protocol):
-    """Add the moments of a run to a history, in a thread of its own."""
-
-    stopped: bool
-
-    def run(self) -> None:
-        """Follow the run until it is over, or ``stopped`` is set."""
-
-
 def _plain_address(text: str) -> bool:
     from ipaddress import ip_address
 
@@ -224,10 +205,8 @@ def _plain_address(text: str) -> bool:
         return False
 
 
-async def _serve(server: ViewServer, source: Source, port: int, address: str | None) -> None:
+async def _serve(server: ViewServer, source: GraphSource | NetworkListener, port: int, address: str | None) -> None:
     """Serve until a signal comes."""
-    import signal
-
     from dtsa_bench.pages.view.server import LOOPBACK
 
     thread = threading.Thread(target=source.run, daemon=True)

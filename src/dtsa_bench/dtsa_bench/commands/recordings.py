@@ -9,7 +9,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from .registry import RECORDED_RUN, Command
+from .registry import RECORDED_RUN, Command, warn
+
+TABLES = ("slots", "frames", "receptions", "decisions", "states", "ages", "ages_by_observer", "distances")
+
+
+_SHOWN = 8  # links that lose most
 
 
 class VerifyCommand(Command):
@@ -18,9 +23,10 @@ Rebuilds every agent and the channel from the recorded configuration, feeds them
 every message of the bag, byte by byte. Exit code 0: all equal; 1: a difference, which is shown."""
     examples = (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON"))
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("bag", nargs="+", help=RECORDED_RUN)
-        parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    options = (
+        ("bag bag...", RECORDED_RUN),
+        ("--json", "print the result as JSON"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Verify the bags."""
@@ -29,14 +35,13 @@ every message of the bag, byte by byte. Exit code 0: all equal; 1: a difference,
         live = sys.stderr.isatty()
 
         def progress(slot: int) -> None:
-            sys.stderr.write(f"\rslot {slot}")
-            sys.stderr.flush()
+            print(f"\rslot {slot}", end="", file=sys.stderr, flush=True)
 
         results = []
         for path in args.bag:
             results.append(verify_bag(path, progress if live else None))
             if live:
-                sys.stderr.write("\r\033[K")
+                print("\r\033[K", end="", file=sys.stderr)
             if not args.json:
                 print(results[-1])
         if args.json:
@@ -50,10 +55,11 @@ Makes a full bag of what a killed recorder, a full disk or a damaged file left: 
 saved, and what is lost. The original is only read."""
     examples = (("runs/a", "into runs/a/bag_recovered"),)
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("bag", help=RECORDED_RUN)
-        parser.add_argument("--out", metavar="DIR", help="where to (default: <bag>_recovered beside the old one)")
-        parser.add_argument("--json", action="store_true", help="print what was saved as JSON")
+    options = (
+        ("bag", RECORDED_RUN),
+        ("--out DIR", "where to (default: <bag>_recovered beside the old one)"),
+        ("--json", "print what was saved as JSON"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Recover the bag."""
@@ -87,12 +93,13 @@ column holds and in which unit."""
         ("runs/a --to csv --tables slots frames --out tables", "two of them as CSV"),
     )
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("bag", help=RECORDED_RUN)
-        parser.add_argument("--to", default="parquet", metavar="FORMAT", help="parquet (default) or csv")
-        parser.add_argument("--out", metavar="DIR", help="where to (default: <bag>_tables beside the bag)")
-        parser.add_argument("--tables", nargs="+", metavar="TABLE", help=f"only these: {' '.join(TABLES)}")
-        parser.add_argument("--json", action="store_true", help="print the files and their rows as JSON")
+    options = (
+        ("bag", RECORDED_RUN),
+        ("--to FORMAT", "parquet (default) or csv", {"default": "parquet"}),
+        ("--out DIR", "where to (default: <bag>_tables beside the bag)"),
+        ("--tables TABLE...", f"only these: {' '.join(TABLES)}"),
+        ("--json", "print the files and their rows as JSON"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Export the bag."""
@@ -104,22 +111,13 @@ column holds and in which unit."""
 
         bag = bag_of(args.bag).resolve()
         target = args.out or bag.with_name(f"{bag.name if bag.is_dir() else bag.stem}_tables")
-        written = export(
-            lambda: open_log(args.bag),
-            target,
-            args.to,
-            args.tables,
-            lambda text: print(f"dtsa: {text}", file=sys.stderr),
-        )
+        written = export(lambda: open_log(args.bag), target, args.to, args.tables, warn)
         if args.json:
             print(json.dumps([{"path": str(table.path), "rows": table.rows} for table in written], indent=2))
             return 0
         for table in written:
             print(f"{table.path}: {table.rows} rows")
         return 0
-
-
-TABLES = ("slots", "frames", "receptions", "decisions", "states", "ages", "ages_by_observer", "distances")
 
 
 class ReportCommand(Command):
@@ -129,9 +127,10 @@ distances, ages, estimate errors, channel use, decisions and the configuration. 
 prints."""
     examples = (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side"))
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{RECORDED_RUN}; up to 8")
-        parser.add_argument("--out", metavar="FILE", help="the page (default: report.html beside the first bag)")
+    options = (
+        ("bags BAG...", f"{RECORDED_RUN}; up to 8"),
+        ("--out FILE", "the page (default: report.html beside the first bag)"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Write the report."""
@@ -164,13 +163,12 @@ bag take like any other."""
         ("runs/cf* --out flight_1", "kept as one bag, for report, export and verify"),
     )
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("bags", nargs="+", metavar="BAG", help="directory of `agent --out`, or its .mcap file")
-        parser.add_argument(
-            "--air-us", metavar="X", default="0", help="a frame is on the air for so long: count overlaps [0]"
-        )
-        parser.add_argument("--out", metavar="DIR", help="keep the whole flight there: bag, and result as summary.json")
-        parser.add_argument("--json", action="store_true", help="print the result as JSON instead of lines")
+    options = (
+        ("bags BAG...", "directory of `agent --out`, or its .mcap file"),
+        ("--air-us X", "a frame is on the air for so long: count overlaps [0]", {"default": "0"}),
+        ("--out DIR", "keep the whole flight there: bag, and result as summary.json"),
+        ("--json", "print the result as JSON instead of lines"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Merge, and print what came of it."""
@@ -191,11 +189,11 @@ bag take like any other."""
         text = json.dumps(summary, indent=2) + "\n"
         print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
         if summary["unheard"]:
-            print(f"dtsa: {summary['unheard']}", file=sys.stderr)
+            warn(summary["unheard"])
         if merged.apart:
-            print(f"dtsa: {clocks_apart(merged.apart)}", file=sys.stderr)
+            warn(clocks_apart(merged.apart))
         for path in merged.nothing_written:
-            print(f"dtsa: {path}: nothing was written there; left out", file=sys.stderr)
+            warn(f"{path}: nothing was written there; left out")
         return 0 if is_verified(summary) and not summary["unheard"] else 1
 
 
@@ -219,12 +217,11 @@ Learns from recorded or merged flights what each directed link lost: its rate, a
 in bursts. --out writes a file that simulate, sweep and fly take as --losses."""
     examples = (("runs/a --out hall.json", "for simulate, sweep and fly, as --losses hall.json"),)
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument(
-            "runs", nargs="+", metavar="RUN", help="run directory, bag directory or .mcap file, also of merge"
-        )
-        parser.add_argument("--out", metavar="FILE", help="write a file of losses, JSON")
-        parser.add_argument("--json", action="store_true", help="print the file of losses instead of lines")
+    options = (
+        ("runs RUN...", "run directory, bag directory or .mcap file, also of merge"),
+        ("--out FILE", "write a file of losses, JSON"),
+        ("--json", "print the file of losses instead of lines"),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Learn, and print what came of it."""
@@ -242,9 +239,6 @@ in bursts. --out writes a file that simulate, sweep and fly take as --losses."""
                 raise ConfigError("out", args.out, f"a file that can be written ({error.strerror})") from None
         print(text if args.json else "\n".join(loss_lines(losses)) + "\n", end="")
         return 0
-
-
-_SHOWN = 8  # links that lose most
 
 
 def loss_lines(losses: dict[str, Any]) -> list[str]:

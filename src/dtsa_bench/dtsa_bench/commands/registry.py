@@ -11,6 +11,7 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 COMMANDS = {
     "demo": "who speaks next, in nine recorded flights, a page and a picture; under a minute",
@@ -37,6 +38,7 @@ COMMANDS = {
 }
 
 RECORDED_RUN = "run directory, bag directory or .mcap file"  # what commands take that read one
+INTERRUPTED = 130  # exit code after Ctrl-C
 
 _MODULES = {
     name: f"dtsa_bench.commands.{module}"
@@ -55,18 +57,42 @@ _MODULES = {
 }
 
 
+Row = tuple[str, str] | tuple[str, str, dict[str, Any]]
+
+
 class Command:
     """A command of the command line. Its class is called after it: that of `fake-crazyflie` is FakeCrazyflieCommand."""
 
     description: str
     examples: tuple[tuple[str, str], ...] = ()  # words after the command's name, and what they do
+    options: tuple[Row, ...] = ()
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add the command's options."""
+        add_rows(parser, self.options)
 
     def run(self, args: argparse.Namespace) -> int:
         """Do it; the exit code."""
         raise NotImplementedError
+
+
+def add_rows(parser: argparse._ActionsContainer, rows: Iterable[Row]) -> None:
+    """Add options: ``--flag``, ``--name VALUE`` or ``name VALUE...``, the help, and more arguments for argparse."""
+    for words, text, *others in rows:
+        name, _, value = words.partition(" ")
+        more: dict[str, Any] = {"help": text, **(others[0] if others else {})}
+        if value:
+            more["metavar"] = value.removesuffix("...").removesuffix("*")
+        if value.endswith(("...", "*")):
+            more["nargs"] = "*" if value.endswith("*") else "+"
+        elif name.startswith("-") and not value and not more.keys() & {"action", "choices"}:
+            more["action"] = "store_true"
+        parser.add_argument(name, **more)
+
+
+def warn(text: str) -> None:
+    """Print a line for the user to standard error."""
+    print(f"dtsa: {text}", file=sys.stderr, flush=True)
 
 
 def add_commands(commands: Mapping[str, str], modules: Mapping[str, str]) -> None:

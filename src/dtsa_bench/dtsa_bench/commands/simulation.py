@@ -9,15 +9,14 @@ import shutil
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dtsa_bench.runs.program import program
 
-from .registry import Command
+from .registry import Command, add_rows, warn
 
 if TYPE_CHECKING:
     from dtsa_bench.experiments.sweep import Sweep
-    from dtsa_bench.simulation.simulate import SimulatedFlight
 
 
 class SimulateCommand(Command):
@@ -35,11 +34,11 @@ every slot has the same sender and every quadcopter the same positions as with `
         from dtsa_bench.runs.options import add_run_options
 
         parser.usage = "%(prog)s [OPTIONS]"
-        parser.add_argument(
-            "--out", metavar="DIR", help="directory for summary.json and config.json; default: only printed"
-        )
-        parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
-        parser.add_argument("--picture", metavar="FILE.png", help="draw the paths from above")
+        add_rows(parser, (
+            ("--out DIR", "directory for summary.json and config.json; default: only printed"),
+            ("--json", "print summary.json instead of lines"),
+            ("--picture FILE.png", "draw the paths from above"),
+        ))  # fmt: skip
         add_run_options(parser)
 
     def run(self, args: argparse.Namespace) -> int:
@@ -59,39 +58,28 @@ every slot has the same sender and every quadcopter the same positions as with `
         summary = flight.summary()
         text = json.dumps(summary, indent=2) + "\n"
         if directory is not None:
-            _write(directory, text, json.dumps(config.to_dict(), indent=2) + "\n")
+            (directory / "summary.json").write_text(text, encoding="utf-8")
+            written = json.dumps(config.to_dict(), indent=2) + "\n"
+            (directory / "config.json").write_text(written, encoding="utf-8")
         print(text if args.json else describe(summary), end="")
-        if picture is not None:
-            _draw(picture, flight, summary)
+        if picture is not None and flight.log is not None:
+            from dtsa_bench.drawing import optional_picture
+
+            with optional_picture(picture):
+                from dtsa_bench.drawing.flight_paths import draw_flight
+
+                draw_flight(picture, flight.scenario, flight.log.positions(), summary)
+                print(f"picture: {picture}", file=sys.stderr)
         return 0
 
 
 def _checked(picture: Path) -> Path:
-    """A file that a picture can be written to.
-
-    :raises ConfigError: if its name or its directory does not fit.
-    """
+    """A file that a picture can be written to."""
     from dtsa_agent.core.errors import ConfigError
 
     if picture.suffix.lower() != ".png" or picture.is_dir() or not picture.parent.is_dir():
         raise ConfigError("picture", str(picture), "a file *.png in a directory that exists")
     return picture
-
-
-def _draw(picture: Path, flight: SimulatedFlight, summary: dict[str, Any]) -> None:
-    from dtsa_bench.drawing import optional_picture
-
-    assert flight.log is not None
-    with optional_picture(picture):
-        from dtsa_bench.drawing.flight_paths import draw_flight
-
-        draw_flight(picture, flight.scenario, flight.log.positions(), summary)
-        print(f"picture: {picture}", file=sys.stderr)
-
-
-def _write(directory: Path, summary: str, config: str) -> None:
-    (directory / "summary.json").write_text(summary, encoding="utf-8")
-    (directory / "config.json").write_text(config, encoding="utf-8")
 
 
 class SweepCommand(Command):
@@ -109,29 +97,25 @@ stopped when the same command is given again. Sweeps of your own: docs/how-to/sw
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         what = parser.add_mutually_exclusive_group(required=True)
-        what.add_argument("--preset", metavar="NAME[,NAME...]", help="sweeps that come with the package; see --list")
-        what.add_argument("--file", metavar="FILE", help="a sweep of your own, in YAML")
-        what.add_argument("--list", action="store_true", help="list the presets")
-        what.add_argument("--show", metavar="NAME", help="print a preset's YAML, to start a sweep of your own from")
-        parser.add_argument(
-            "--out", metavar="DIR", help="directory for the results [runs/NAME]; several presets: one each in it"
-        )
-        parser.add_argument("--seeds", metavar="N", help="number of seeds [the sweep's own]")
-        parser.add_argument("--first-seed", metavar="N", help="first of them [1001]")
-        parser.add_argument("--jobs", metavar="N", help="processes [all cores]")
-        parser.add_argument(
-            "--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting of the base"
-        )
-        parser.add_argument(
-            "--losses", metavar="FILE", help="fly in losses that were measured, as simulate --losses does"
-        )
-        parser.add_argument("--cluster", metavar="tcp://HOST:PORT", help="fly on a Dask cluster with this scheduler")
-        parser.add_argument("--no-report", action="store_true", help="only results.csv and results.json")
-        parser.add_argument(
-            "--paper", metavar="FORMAT",
-            help="also write DIR/paper: figures (pdf, svg or png), table.tex and table.csv, which say how",
-        )  # fmt: skip
-        parser.add_argument("--json", action="store_true", help="print the contents of results.json instead of tables")
+        add_rows(what, (
+            ("--preset NAME[,NAME...]", "sweeps that come with the package; see --list"),
+            ("--file FILE", "a sweep of your own, in YAML"),
+            ("--list", "list the presets"),
+            ("--show NAME", "print a preset's YAML, to start a sweep of your own from"),
+        ))  # fmt: skip
+        add_rows(parser, (
+            ("--out DIR", "directory for the results [runs/NAME]; several presets: one each in it"),
+            ("--seeds N", "number of seeds [the sweep's own]"),
+            ("--first-seed N", "first of them [1001]"),
+            ("--jobs N", "processes [all cores]"),
+            ("--set NAME=VALUE", "change a setting of the base", {"action": "append", "default": []}),
+            ("--losses FILE", "fly in losses that were measured, as simulate --losses does"),
+            ("--cluster tcp://HOST:PORT", "fly on a Dask cluster with this scheduler"),
+            ("--no-report", "only results.csv and results.json"),
+            ("--paper FORMAT", "also write DIR/paper: figures (pdf, svg or png), table.tex and table.csv, which say "
+             "how"),
+            ("--json", "print the contents of results.json instead of tables"),
+        ))  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Fly what is missing, then sum up."""
@@ -209,5 +193,5 @@ def _fly_sweep(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
         print((directory / "results.json").read_text(encoding="utf-8"), end="")
     reasons = [row["reason"] for row in table.rows if row["status"] == FAILED]
     if reasons:
-        print(f"dtsa: {len(reasons)} runs failed: {reasons[0]}", file=sys.stderr)
+        warn(f"{len(reasons)} runs failed: {reasons[0]}")
     return 1 if reasons else 0

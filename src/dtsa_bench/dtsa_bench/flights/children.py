@@ -40,12 +40,14 @@ class Child:
     module: str
     arguments: Sequence[str]
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether the process has ended."""
+        return self.process.poll() is not None
+
 
 class Children:
-    """The processes that one supervisor started.
-
-    :param environment: their environment variables, on top of this process's.
-    """
+    """The processes that one supervisor started, with these environment variables on top of its own."""
 
     def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
         self._logs = logs
@@ -80,33 +82,25 @@ class Children:
 
     def ended(self) -> list[Child]:
         """Processes that have ended since this was asked last."""
-        fresh = [child for child in self.all if child.process.poll() is not None and child not in self._reported]
+        fresh = [child for child in self.all if child.has_ended and child not in self._reported]
         self._reported += fresh
         return fresh
 
     def check(self) -> None:
-        """Looks whether all are alive.
-
-        :raises NodeError: naming those that are not, and why.
-        """
-        ended = [child for child in self.all if child.process.poll() is not None]
-        if ended:
+        """NodeError: some have ended; it names them, and why."""
+        if ended := [child for child in self.all if child.has_ended]:
             raise NodeError("; ".join(describe_end(child) for child in ended))
 
-    def stop(self, hurry: bool = False) -> list[str]:
-        """Waits until all have ended, and helps those that do not."""
-        helped: dict[str, None] = {}
+    def stop(self, hurry: bool = False) -> None:
+        """Wait until all have ended, and help those that do not."""
         leave_s, term_s = (_HURRY_S, _HURRY_S) if hurry else (_LEAVE_S, _TERM_S)
-        for number, patience in ((None, leave_s), (signal.SIGTERM, term_s), (signal.SIGKILL, 10.0)):
-            alive = [child for child in self.all if child.process.poll() is None]
-            if number is not None:
-                for child in alive:
-                    helped[child.name] = None
-                    child.process.send_signal(number)
+        for number, patience in ((0, leave_s), (signal.SIGTERM, term_s), (signal.SIGKILL, 10.0)):
+            alive = [child for child in self.all if not child.has_ended]
+            for child in alive:
+                child.process.send_signal(number)
             deadline = time.monotonic() + patience
-            while time.monotonic() < deadline and any(child.process.poll() is None for child in alive):
+            while time.monotonic() < deadline and not all(child.has_ended for child in alive):
                 time.sleep(0.01)
-        return list(helped)
 
 
 def describe_end(child: Child) -> str:

@@ -32,26 +32,22 @@ def clear_hindrances(environment: MutableMapping[str, str]) -> None:
     ):
         if wrong:
             instead = f"{value} is taken" if value else "none is asked"
-            said = f"{name}={environment.pop(name)} does not count in a flight on this machine alone: {instead}"
-            print(f"dtsa: {said}", file=sys.stderr, flush=True)
+            text = f"{name}={environment.pop(name)} does not count in a flight on this machine alone: {instead}"
+            print(f"dtsa: {text}", file=sys.stderr, flush=True)
             environment |= {name: value} if value else {}
 
 
 @contextmanager
 def ros_domain(wanted: int | None = None, *, shared: bool = False) -> Iterator[int]:
-    """Takes a domain for as long as the context lasts.
+    """Take a domain for as long as the context lasts.
 
     :param wanted: number of the domain, 0 to 232; None: any that is free.
-    :raises ConfigError: if the wanted one is in use.
-    :raises DtsaError: if all are in use.
+    :raises DtsaError: it, or all are in use.
     """
     if wanted is not None and not 0 <= wanted <= LAST_DOMAIN:
         raise ConfigError("domain", wanted, f"0 to {LAST_DOMAIN}")
-    first = os.getpid() * _SPREAD
-    candidates = (
-        [wanted] if wanted is not None else [1 + (first + i) % LAST_FREE_DOMAIN for i in range(LAST_FREE_DOMAIN)]
-    )
-    for domain in candidates:
+    candidates = [1 + (os.getpid() * _SPREAD + i) % LAST_FREE_DOMAIN for i in range(LAST_FREE_DOMAIN)]
+    for domain in candidates if wanted is None else [wanted]:
         lock = _lock(domain)
         if lock is None:
             continue

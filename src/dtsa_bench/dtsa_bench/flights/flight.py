@@ -1,21 +1,20 @@
 """One flight with real nodes: the channel and the recorder in this process, the agents in others.
 
-This module owns the order in which a flight ends; each step is elsewhere, and has a limit of its own:
+This module owns the order in which a flight ends, however it ends; each step has a limit of its own:
 
-1. **Why.** The run is over (all have arrived, or its limits), or a `StopToken` is true: a signal, or no
-   more wall time. Or an error: a node has died, the recorder cannot write. Ctrl-C reaches this process alone
-   (`children.Children.start`), and sets a flag (`dtsa_agent/stop.py`): the slot that goes on is carried out whole.
+1. **Why.** The run is over, or a `StopToken` is true (a signal, or no more wall time), or an error. Ctrl-C reaches this
+   process alone (`children.Children.start`), and sets a flag (`dtsa_agent/stop.py`): the slot that goes on is carried
+   out whole.
 2. **The channel** leaves its loop and publishes the END message, by which agents end by themselves.
-3. **The bag.** `channel.close()` (in :func:`_run`) closes the observers first, the recorder among them: from here on
-   the bag is whole, whatever happens to processes. Then it waits up to ``END_S`` until all nodes have heard of the end.
-4. **The processes.** `children.stop()` waits 3 s for them, sends SIGTERM, waits 1 s, sends SIGKILL; after a signal from
-   the user 0.3 s each.
+3. **The bag.** `channel.close()` closes the observers, the recorder first: from here on the bag is whole, whatever
+   happens to processes. Then it waits up to ``END_S`` until all nodes have heard of the end.
+4. **The processes.** `children.stop()` waits for them, sends SIGTERM, waits, sends SIGKILL.
 5. **The results:** summary and picture, from the metrics of this process; no picture after an early end. Then an error
    of the flight is raised.
 6. **The node** of this process is destroyed last of all, and its ROS context after it.
 
-In :func:`fly` all of it happens however the flight ends. If a call into a library stands still after a signal, `Stop`
-ends this process after its patience, with the place of each thread.
+If a call into a library stands still after a signal, `Stop` ends this process after its patience, with the place of
+each thread.
 """
 
 from __future__ import annotations
@@ -60,12 +59,8 @@ from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import LateStart, RealtimeSupervisor, Supervisor
 
-ENVIRONMENT = {
-    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    # A node needs no more threads than its own: NumPy's would cost start-up time and memory.
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-}
+# A node needs no more threads than its own: NumPy's would cost start-up time and memory.
+ENVIRONMENT = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 # The log of this process's nodes goes to /rosout alone: the progress line tells the same here.
 QUIET = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
@@ -74,15 +69,20 @@ END_S = 1.0  # wall time in which the nodes are to hear of the end; those that h
 
 
 def run_environment(domain: int, logs: Path) -> dict[str, str]:
-    """Variables for the processes of a run; this process gets those that its own node needs.
-
-    :param logs: directory for ROS's logs.
-    """
+    """Variables for the processes of a run; this process gets those that its own node needs."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     limit_to_machine(os.environ)
     os.environ["ROS_LOG_DIR"] = str(logs.resolve())
     return {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs.resolve())}
+
+
+def parameter_arguments(directory: Path, parameters: dict[str, Any]) -> list[str]:
+    """Write parameters of agents' nodes into a file; the arguments by which a node reads them, and logs little."""
+    path = directory / "parameters.yaml"
+    content = {"/**": {"ros__parameters": parameters}}
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    return ["--ros-args", "--params-file", str(path), "--disable-external-lib-logs", "--disable-rosout-logs"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,14 +102,16 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
     """
     check_key(run.swarm)
     make_scenario(run.swarm)  # says so if the field is larger than frames can say
-    agents = run.swarm.agents
+    agents, policy, late = run.swarm.agents, run.swarm.policy_row, dict(options.late)
     if options.processes is not None and options.processes > agents:
         raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
-    if run.swarm.estimator_row.needs_everybody and (run.mode != LOCKSTEP or (options.processes or agents) > 1):
-        allowed = "hold, linear or intent; the oracle in lockstep with --processes 1 only"
-        raise ConfigError("estimator", "oracle", allowed)
-    _check_policy(run, options)
-    late = dict(options.late)
+    check_slotted(policy.name)
+    if run.mode != LOCKSTEP or (options.processes or agents) > 1:
+        if run.swarm.estimator_row.needs_everybody:
+            allowed = "hold, linear or intent; the oracle in lockstep with --processes 1 only"
+            raise ConfigError("estimator", "oracle", allowed)
+        if policy.needs_everybody:
+            raise ConfigError("policy", policy.name, "in lockstep with --processes 1 only: it looks into all agents")
     for name, value in (("respawn", options.respawn), ("late", late or None)):
         if value is not None and run.mode == LOCKSTEP:
             raise ConfigError(name, value, "only with --mode realtime: in lockstep all wait for all")
@@ -119,14 +121,6 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
         raise ConfigError("late", late, f"some, not all, of the agents 1 to {agents}")
     if late and options.processes is not None:
         raise ConfigError("late", late, "only with --processes per-agent")
-
-
-def _check_policy(run: RunConfig, options: FlightOptions) -> None:
-    """What the policy asks of a flight of nodes."""
-    row = run.swarm.policy_row
-    check_slotted(row.name)
-    if row.needs_everybody and (run.mode != LOCKSTEP or (options.processes or run.swarm.agents) > 1):
-        raise ConfigError("policy", row.name, "in lockstep with --processes 1 only: it looks into all agents")
 
 
 def fly(
@@ -199,7 +193,9 @@ def _fly(
         children.stop(hurry=bool(stop))
         try:
             pictures = options.pictures and not ended and failure is None
-            summary = flight.write_results(pictures, **_cut_short(channel, ended, failure))
+            # Why it ended before its time: not if the user ended it.
+            reason = str(failure or "") or ended.reason or getattr(channel, "fell_behind", "")
+            summary = flight.write_results(pictures, **({"cut_short": reason} if reason else {}))
         except OSError:
             if failure is None:
                 raise
@@ -215,9 +211,8 @@ def _fly(
 def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: FlightProgress, priority: int) -> None:
     """The flight itself; the channel is closed afterwards."""
     # Before its agents, and both before all else if that is allowed.
-    first = isinstance(channel, RealtimeChannel) and not set_realtime_or_nice(
-        priority and priority + 1, CHANNEL_NICE, False
-    )
+    own = priority and priority + 1
+    first = isinstance(channel, RealtimeChannel) and not set_realtime_or_nice(own, CHANNEL_NICE, False)
     try:
         channel.run(ended)
         shown.show()
@@ -232,24 +227,11 @@ def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: Fl
                 set_nice(0)
 
 
-def _cut_short(channel: Any, ended: StopToken, failure: DtsaError | None) -> dict[str, str]:
-    """Why a flight ended before its time, as the summary has it; empty if it did not, or the user ended it."""
-    reason = str(failure or "") or ended.reason or getattr(channel, "fell_behind", "")
-    return {"cut_short": reason} if reason else {}
-
-
 def _start_agents(
     children: Children, run: RunConfig, options: FlightOptions, directory: Path, stop: Stop
 ) -> list[LateStart]:
-    """Starts the agents' processes, but for those that come late.
-
-    :raises KeyboardInterrupt: on a signal; not while a process is being started, so that none is forgotten.
-    """
-    parameters = directory / "parameters.yaml"
-    values = {**to_parameters(run.swarm.to_dict(), SwarmConfig), "mode": run.mode}
-    content = {"/**": {"ros__parameters": values}}
-    parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    common = ["--ros-args", "--params-file", str(parameters), "--disable-external-lib-logs", "--disable-rosout-logs"]
+    """Start the agents' processes, but for those that come late; KeyboardInterrupt: on a signal, between two."""
+    common = parameter_arguments(directory, {**to_parameters(run.swarm.to_dict(), SwarmConfig), "mode": run.mode})
     late: list[LateStart] = []
     for process in agent_processes(run, options.processes, options.priority):
         if stop:

@@ -2,43 +2,59 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
-import weakref
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Scenario, Swarm
+from dtsa_agent.core import Scenario
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import FlightMetrics, metrics_tables
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
-from dtsa_channel_sim.ros.observer import ChannelObserver, Referee
+from dtsa_channel_sim.ros.observer import ChannelObserver
+
+_MAX_PATH_BYTES = 1 << 24
 
 
-class FlightMeasurement(ChannelObserver, Referee):
-    """Follows a flight with the metrics; as its referee, ends it when they say so."""
+class FlightPath:
+    """Where all were at the starts of slots, in bounded memory: when it is full, every second slot is forgotten."""
+
+    def __init__(self, agents: int) -> None:
+        self._kept: list[NDArray[np.float64]] = []
+        self._agents, self._slots, self._every = agents, 0, 1
+
+    def append(self, position: NDArray[np.float64]) -> None:
+        """Add a slot, (3, N) m, frame map."""
+        if self._slots % self._every == 0:
+            self._kept.append(position.copy())
+        self._slots += 1
+        if len(self._kept) * position.nbytes > _MAX_PATH_BYTES:
+            del self._kept[1::2]
+            self._every *= 2
+
+    def array(self) -> NDArray[np.float64]:
+        """(T, 3, N) m, frame map."""
+        return np.array(self._kept).reshape(-1, 3, self._agents)
+
+
+class FlightMeasurement(ChannelObserver):
+    """Follows a flight with the metrics, and knows when they say that it is over."""
 
     def __init__(self, run: RunConfig, scenario: Scenario) -> None:
         self.scenario = scenario
         self.metrics = FlightMetrics(run, scenario)
         self.hearing = DeliveryCounts(run.swarm.agents)
-        self.positions = PositionLog(run.swarm.agents)
+        self.positions = FlightPath(run.swarm.agents)
         self.begin_s = self.end_s = 0.0  # wall clock: slot 0 answered by all, flight over; 0: not yet
-        self._tables = metrics_tables(run, scenario, everyone=True)
+        self.tables = metrics_tables(run, scenario, everyone=True)  # what each agent knows by what it has received
         self._agents = run.swarm.agents
         self._oracle = run.swarm.estimator_row.needs_everybody
         self._outcome = 0
         self._lengths: list[int] = []  # of the frames of the slot that is being flown
-        self._compared = self._tables.digest, self._tables.chosen  # of the slot that is being flown
-
-    @property
-    def tables(self) -> Swarm:
-        """What each agent knows by what it has received: one table an agent."""
-        return self._tables
+        self._compared = self.tables.digest, self.tables.chosen  # of the slot that is being flown
 
     @property
     def wall_time_s(self) -> float:
@@ -55,36 +71,28 @@ class FlightMeasurement(ChannelObserver, Referee):
             return
         self.metrics.compare_tables(slot - 1, *self._compared)
         if self._oracle:
-            self._tables.estimate_position[:] = answers.position
-        if self.metrics.update(slot - 1, answers.track, self._tables, self._outcome, self._lengths):
+            self.tables.estimate_position[:] = answers.position
+        if self.metrics.update(slot - 1, answers.track, self.tables, self._outcome, self._lengths):
             self.end_s = time.monotonic()
 
-    def over(self, slot: int, answers: Answers) -> bool:
-        return bool(self.metrics.end)
-
-    @property
-    def reason(self) -> str:
+    def over(self) -> str:
+        """Why the flight is over; empty: it goes on."""
         return str(self.metrics.end or "")
 
     def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         self._outcome = verdict.outcome
         self._compared = answers.digest.copy(), answers.chosen.copy()
         self._lengths = [len(frames[sender]) for sender in verdict.senders]
-        self.scenario.advance(slot, self._tables)  # what all know about each other's goals
+        self.scenario.advance(slot, self.tables)  # what all know about each other's goals
         mask = verdict.mask(self._agents)
         self.hearing.add_slot(len(verdict.senders), mask)
+        heard = [(slot, frames[sender], mask[row]) for row, sender in enumerate(verdict.senders) if mask[row].any()]
         if answers.receipts is not None:  # in real time the receivers themselves know best
-            for taken in answers.receipts:
-                self._hear(taken.slot, taken.data, taken.mask)
-        else:
-            for row, sender in enumerate(verdict.senders):
-                if mask[row].any():
-                    self._hear(slot, frames[sender], mask[row])
-        self._tables.end(slot)
-
-    def _hear(self, slot: int, data: bytes, mask: NDArray[np.bool_]) -> None:
-        if self._tables.hear(slot, data, mask):
-            self.hearing.add_accepted(mask)
+            heard = [(taken.slot, taken.data, taken.mask) for taken in answers.receipts]
+        for sent_slot, data, receivers in heard:
+            if self.tables.hear(sent_slot, data, receivers):
+                self.hearing.add_accepted(receivers)
+        self.tables.end(slot)
 
     def agent_silent(self, agent: int) -> None:
         self.metrics.lose(agent)
@@ -99,54 +107,3 @@ class FlightMeasurement(ChannelObserver, Referee):
     def summary(self) -> dict[str, Any]:
         """The results so far, with the keys of ``summary.json``."""
         return self.metrics.summary(self.wall_time_s)
-
-
-_IN_MEMORY = 1 << 20  # bytes; what is longer goes to a temporary file
-
-
-class PositionLog:
-    """(3, N) m at each slot's start, one after the other."""
-
-    def __init__(self, agents: int) -> None:
-        self._agents = agents
-        self._count = 0
-        self._recent = bytearray()
-        self._file: IO[bytes] | None = None
-        self._full = False
-
-    def __len__(self) -> int:
-        return self._count
-
-    def append(self, position: NDArray[np.float64]) -> None:
-        """Adds a slot. Where there is no more room on the disk, what comes later is not kept.
-
-        :param position: (3, N) m, frame map.
-        """
-        if self._full:
-            return
-        self._recent += position.tobytes()
-        self._count += 1
-        if len(self._recent) > _IN_MEMORY:
-            self._save()
-
-    def _save(self) -> None:
-        try:
-            if self._file is None:
-                self._file = tempfile.TemporaryFile()  # noqa: SIM115
-                weakref.finalize(self, self._file.close)
-            self._file.write(self._recent)
-            self._file.flush()
-        except OSError:  # a picture then ends early; the flight does not
-            self._full = True
-            self._count -= len(self._recent) // (24 * self._agents)
-        self._recent.clear()
-
-    def array(self) -> NDArray[np.float64]:
-        """(T, 3, N) m, all that is kept; a long flight's stays on the disk and is read when it is used."""
-        shape = (self._count, 3, self._agents)
-        if self._file is None:
-            return np.frombuffer(bytes(self._recent), dtype=np.float64).reshape(shape)
-        if self._recent:
-            self._save()
-            shape = (self._count, 3, self._agents)
-        return np.memmap(self._file, np.float64, "r", shape=shape)

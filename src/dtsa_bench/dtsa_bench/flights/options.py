@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -14,8 +14,7 @@ from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import make_clocks
 from dtsa_channel_sim.model.config import AnswerLimits
 
-# Process priority in real time where there is no real-time priority: agents give way to the channel, which goes first
-# where it may.
+# Where there is no real-time priority: agents give way to the channel, which goes first where it may.
 AGENTS_NICE, CHANNEL_NICE = 5, -10
 
 
@@ -71,10 +70,7 @@ class AgentProcess:
 
 
 def process_count(text: str, agents: int) -> int | None:
-    """Return in how many processes agents live, from ``per-agent`` or a number; None: one an agent.
-
-    :raises ConfigError: for another text, or more processes than agents.
-    """
+    """Return in how many processes agents live, from ``per-agent`` or a number; None: one an agent."""
     if text == "per-agent":
         return None
     if not text.isdecimal() or not 1 <= int(text) <= agents:
@@ -90,33 +86,24 @@ def agent_processes(
     ``processes``: how many, with as many agents each as can be; None: one an agent.
     """
     agents = run.swarm.agents
+    clocks, airtime = make_clocks(run.clocks, agents), run.air.airtime
+    under_way = [airtime.total_ns(length) + airtime.from_radio_ns(length) for length in (0, 1)]
     bounds = [agents * number // (processes or agents) for number in range((processes or agents) + 1)]
     result = []
     for number, (first, last) in enumerate(pairwise(bounds), 1):
+        own: dict[str, Any] = {} if run.mode == LOCKSTEP else {
+            "clock_offset_ns": [clock.offset_ns for clock in clocks[first:last]],
+            "clock_drift_ppb": [clock.drift_ppb for clock in clocks[first:last]],
+            "clock_jitter_ns": float(run.clocks.jitter_ns),
+            "align": run.align,
+            "flight_time_ns": [under_way[0], under_way[1] - under_way[0]],
+            "nice": AGENTS_NICE,
+            "priority": priority,
+        }  # fmt: skip
         ids = tuple(range(first + 1, last + 1))
-        own = _realtime_parameters(run, ids, priority)
         if processes is None:
             place = names.agent_namespace(number, space)
             result.append(AgentProcess("agent", place, "agent", ids, {"id": number, **own}))
         else:
             result.append(AgentProcess("swarm_host", space, f"swarm_host_{number}", ids, {"ids": list(ids), **own}))
     return result
-
-
-def _realtime_parameters(run: RunConfig, ids: Sequence[int], priority: int) -> dict[str, Any]:
-    """Return clocks of some agents, time of a frame and priority, in real time; nothing in lockstep."""
-    if run.mode == LOCKSTEP:
-        return {}
-    all_clocks = make_clocks(run.clocks, run.swarm.agents)
-    clocks = [all_clocks[agent - 1] for agent in ids]
-    airtime = run.air.airtime
-    under_way = [airtime.total_ns(length) + airtime.from_radio_ns(length) for length in (0, 1)]
-    return {
-        "clock_offset_ns": [clock.offset_ns for clock in clocks],
-        "clock_drift_ppb": [clock.drift_ppb for clock in clocks],
-        "clock_jitter_ns": float(run.clocks.jitter_ns),
-        "align": run.align,
-        "flight_time_ns": [under_way[0], under_way[1] - under_way[0]],
-        "nice": AGENTS_NICE,
-        "priority": priority,
-    }

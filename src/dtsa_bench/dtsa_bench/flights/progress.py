@@ -16,10 +16,7 @@ _TERMINAL_S, _LOG_S = 0.2, 5.0
 
 
 class ProgressLine:
-    """Rewrites one line on a terminal; elsewhere prints a line every few seconds.
-
-    :param stream: where to; default: standard error.
-    """
+    """Rewrites one line on a terminal (default: standard error); elsewhere prints a line every few seconds."""
 
     def __init__(self, label: str, stream: TextIO | None = None) -> None:
         self._label = label
@@ -36,23 +33,21 @@ class ProgressLine:
         """Shows a text in place of the last one."""
         self._next = time.monotonic() + (_TERMINAL_S if self._terminal else _LOG_S)
         self._shown = True
-        if self._terminal:
-            self._stream.write(f"\r\x1b[K{self._label}: {text}")
-        else:
-            self._stream.write(f"{self._label}: {text}\n")
-        self._stream.flush()
+        self._write(text, "" if self._terminal else "\n")
+
+    def _write(self, text: str, end: str) -> None:
+        clear = "\r\x1b[K" if self._terminal else ""
+        print(f"{clear}{self._label}: {text}", end=end, file=self._stream, flush=True)
 
     def print_line(self, text: str) -> None:
         """Prints a line that stays."""
-        self._stream.write(f"\r\x1b[K{self._label}: {text}\n" if self._terminal else f"{self._label}: {text}\n")
-        self._stream.flush()
+        self._write(text, "\n")
         self._next = 0.0
 
     def end(self) -> None:
         """Leaves the last line where it is."""
         if self._terminal and self._shown:
-            self._stream.write("\n")
-            self._stream.flush()
+            print(file=self._stream, flush=True)
         self._shown = False
 
 

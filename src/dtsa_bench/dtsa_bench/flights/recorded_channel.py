@@ -34,15 +34,14 @@ from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 from .measurement import FlightMeasurement
 from .recorder import FlightRecorder
 from .slot_messages import LiveTopics
-from .statistics import ClockStatistics, DeliveryStatistics, channel_summary, warning
+from .statistics import TimingStatistics, channel_summary, warning
 
 BAG = "bag"  # the bag's directory within a flight's directory
 
 
 class RecordedFlight:
-    """A channel, and those that observe it in a recorded flight.
+    """A channel, and those that observe it in a recorded flight; its settings are parameters of the node.
 
-    :param node: the ROS node; the channel's settings are its parameters.
     :param directory: the flight's directory; the bag becomes a directory in it.
     :param space: namespace of the swarm's topics; those in the bag have the default one.
     """
@@ -58,15 +57,16 @@ class RecordedFlight:
         self.run_config, self.directory = run, directory
         self.scenario = make_scenario(run.swarm)
         self.measurement = FlightMeasurement(run, self.scenario)
-        model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
+        model, steps, over = Channel(run.air), run.swarm.steps, self.measurement.over
         self.run_id = identity.number
-        limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed}
-        limits["swarm_namespace"] = space
-        self.channel: LockstepChannel | RealtimeChannel
-        if run.mode == LOCKSTEP:
-            self.channel = LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
-        else:
-            self.channel = RealtimeChannel(node, model, steps, referee=referee, **limits)
+        limits: dict[str, Any] = {
+            "startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed, "swarm_namespace": space,
+        }  # fmt: skip
+        self.channel: LockstepChannel | RealtimeChannel = (
+            LockstepChannel(node, model, steps, answer_s, over=over, **limits)
+            if run.mode == LOCKSTEP
+            else RealtimeChannel(node, model, steps, over=over, **limits)
+        )
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
             FlightRecorder(directory / BAG, run, self.scenario, self.run_id),
@@ -74,27 +74,29 @@ class RecordedFlight:
             LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id, space),
         )
         watch(self.channel, node, run.to_dict(), space)
-        self._clocks, self._delivery = ClockStatistics(run.swarm.agents), DeliveryStatistics(run.swarm.agents)
+        self._timing = TimingStatistics(run.swarm.agents)
         if run.mode != LOCKSTEP:
-            self.channel.observe(self._clocks, self._delivery)
+            self.channel.observe(self._timing)
         follow_parameters(node, model, self.channel.change_settings)
 
     def summary(self) -> dict[str, Any]:
         """The flight's results."""
         channel = self.channel
-        result = {**self.measurement.summary(), "unusable_messages": channel.intake.total}
-        result["not_taken_in"] = kept_out = dict(sorted(channel.dropped().items()))
-        hearing = self.measurement.hearing
-        hearing.subtract_refused(kept_out)
-        result["receptions"] = {"delivered": hearing.delivered, "taken_in": hearing.accepted}
-        result["unheard"] = hearing.problem(kept_out) or None
+        hearing, refused = self.measurement.hearing, dict(sorted(channel.dropped().items()))
+        hearing.subtract_refused(refused)
+        result = {
+            **self.measurement.summary(),
+            "unusable_messages": channel.intake.total,
+            "not_taken_in": refused,
+            "receptions": {"delivered": hearing.delivered, "taken_in": hearing.accepted},
+            "unheard": hearing.problem(refused) or None,
+        }
         if isinstance(channel, RealtimeChannel):
             result |= {
                 "mode": self.run_config.mode,
                 "returned_agents": sorted(channel.returned),
                 **channel_summary(channel),
-                **self._delivery.summary(),
-                **self._clocks.summary(),
+                **self._timing.summary(),
             }
             result["warning"] = warning(channel, result)
         return result
@@ -104,21 +106,18 @@ class RecordedFlight:
         summary = {**self.summary(), **more}
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         (self.directory / "summary.json").write_text(text, encoding="utf-8")
-        positions = self.measurement.positions
-        if positions and pictures:
+        path = self.measurement.positions.array()
+        if len(path) and pictures:
             picture = self.directory / "trajectories.png"
             with optional_picture(picture):
                 from dtsa_bench.drawing.flight_paths import draw_flight
 
-                draw_flight(picture, self.scenario, positions.array(), summary)
+                draw_flight(picture, self.scenario, path, summary)
         return summary
 
 
 def declare_run(node: Node) -> RunConfig:
-    """Declares all settings of a run as parameters and reads them.
-
-    :raises ConfigError: for settings that are not usable.
-    """
+    """Declare all settings of a run as parameters and read them; ConfigError: they are not usable."""
     swarm = SwarmConfig.from_dict(declare_settings(node, SwarmConfig))
     channel = declare_settings(node, ChannelConfig, skip=FROM_SWARM, changeable=True)
     file = declare_setting(node, Setting("channel_file", "text", "", "YAML file with further settings of the channel"))
@@ -131,10 +130,8 @@ def declare_run(node: Node) -> RunConfig:
         air = ChannelConfig.from_dict({**channel, **derived})
     limits = RunLimits(**declare_settings(node, RunLimits))
     clocks = ClockConfig(**declare_settings(node, ClockConfig, prefix="clocks."))
-    plain = {
-        spec.name: declare_setting(node, spec) for spec in settings_of(RunConfig) if spec.name in ("mode", "align")
-    }
-    return RunConfig(swarm, air, limits, clocks=clocks, **plain)
+    own = {spec.name: declare_setting(node, spec) for spec in settings_of(RunConfig) if spec.name in ("mode", "align")}
+    return RunConfig(swarm, air, limits, clocks=clocks, **own)
 
 
 def _body(stop: Stop, supervised: bool) -> None:

@@ -38,12 +38,10 @@ _REPORTED = ("chosen", "reason", "digest", "score", "offset_ns", "track", "veloc
 
 
 class FlightRecorder(ChannelObserver):
-    """Writes a flight into a bag, slot after slot; see docs/reference/bag.md for topics and times.
+    """Writes a flight into a bag, slot after slot; see docs/reference/nodes.md for topics and times.
 
     A slot counts as flown once all agents have told where it took them, in their answers to the next one. What a flight
     that is cut short leaves half done does not get into its bag.
-
-    :param directory: the bag's directory.
     """
 
     def __init__(self, directory: Path, run: RunConfig, scenario: Scenario, run_id: int) -> None:
@@ -61,7 +59,7 @@ class FlightRecorder(ChannelObserver):
         self._event = 0
         spaces = [names.agent_namespace(agent) for agent in range(1, agents + 1)]
         self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
-        self._packer = OdometryPacker([names.body_frame(space) for space in spaces], names.FRAME)
+        self._packer = OdometryPacker([names.body_frame(space) for space in spaces])
         self._accounts = None if run.mode == LOCKSTEP else RealtimeAccounts(agents, self._steps, self._slot_ns)
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1
@@ -87,8 +85,7 @@ class FlightRecorder(ChannelObserver):
         self._complete = slot
         self._answered[:], self._track[:] = answers.answered, answers.track
         if not slot:
-            self._state.phase = RunStatus.FLYING
-            self._write_status()
+            self._write_status(phase=RunStatus.FLYING)
 
     def agent_silent(self, agent: int) -> None:
         self._state.lose(agent)
@@ -104,12 +101,12 @@ class FlightRecorder(ChannelObserver):
         self._write_status()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
-        self._state.phase, self._state.reason = RunStatus.ENDED, reason
+        self._state.reach(self._complete, phase=RunStatus.ENDED, reason=reason)
 
-    def _write_status(self) -> None:
-        self._state.slot = max(0, self._complete)
-        at = self._time_ns(self._state.slot)
-        self.bag.write(self._status, bytes(serialize_message(self._state.message())), at, at)
+    def _write_status(self, **changed: Any) -> None:
+        self._state.reach(self._complete, **changed)
+        at = self._time_ns(max(0, self._complete))
+        self.bag.write(self._status, bytes(serialize_message(self._state.message)), at, at)
 
     def _write_pending(self) -> None:
         """Write all about the slot before the last one that was answered."""
@@ -117,18 +114,17 @@ class FlightRecorder(ChannelObserver):
             for channel, data, at in self._pending:
                 self.bag.write(channel, data, at, at)
             self._pending = []
-            if self._accounts is not None:
-                self._write_accounts(self._accounts, self._pending_slot)
+            self._write_accounts(self._pending_slot)
             self.bag.mark()
 
-    def _write_accounts(self, accounts: RealtimeAccounts, closed: int, at_end: bool = False) -> None:
+    def _write_accounts(self, closed: int, at_end: bool = False) -> None:
         """Write the records of slots in real time for which nothing is waited for any more."""
-        for slot, fields in accounts.pop(closed, at_end):
-            self._write_record(slot, pack_record(self._run_id, slot, self._time_ns(slot), self._steps, **fields))
+        for slot, fields in self._accounts.pop(closed, at_end) if self._accounts is not None else ():
+            self._write_record(slot, fields)
 
-    def _write_record(self, slot: int, data: bytes) -> None:
+    def _write_record(self, slot: int, fields: dict[str, Any]) -> None:
         at = self._time_ns(slot)
-        self.bag.write(self._record, data, at, at)
+        self.bag.write(self._record, pack_record(self._run_id, slot, at, self._steps, **fields), at, at)
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self._write_pending()
@@ -155,12 +151,9 @@ class FlightRecorder(ChannelObserver):
         """Write what is complete and finish the bag."""
         self._write_pending()
         if self._complete >= 0:
-            if self._accounts is not None:
-                self._write_accounts(self._accounts, self._complete - 1, at_end=True)
+            self._write_accounts(self._complete - 1, at_end=True)
             here = np.flatnonzero(self._answered)
-            place = {"agent": here + 1, "track": self._track[:, :, here]}
-            end = pack_record(self._run_id, self._complete, self._time_ns(self._complete), self._steps, **place)
-            self._write_record(self._complete, end)
+            self._write_record(self._complete, {"agent": here + 1, "track": self._track[:, :, here]})
         self._write_status()
         self.bag.close()
 
@@ -195,21 +188,20 @@ class RealtimeAccounts:
         self._unresolved: dict[int, deque[_SentFrame]] = {}  # by sender
         self.lost: set[int] = set()  # ids of agents that nothing is waited for from
 
-    def _account(self, slot: int) -> _Account | None:
-        """The account of a slot; None if it is written already."""
-        if slot < self._next:
-            return None
-        if slot not in self._open:
-            self._open[slot] = _Account(self._agents, self._steps)
-        return self._open[slot]
+    def _account(self, slot: int) -> _Account:
+        """The account of a slot; of one that is written already, one that nothing comes of."""
+        if slot in self._open:
+            return self._open[slot]
+        account = _Account(self._agents, self._steps)
+        if slot >= self._next:
+            self._open[slot] = account
+        return account
 
     def add_frame(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
         """A frame goes on the air."""
         frame = _SentFrame(data, start_ns)
         self._unresolved.setdefault(sender, deque()).append(frame)
-        account = self._account(slot)
-        if account is not None:
-            account.sent_frames.setdefault(sender, frame)
+        self._account(slot).sent_frames.setdefault(sender, frame)
 
     def resolve(self, verdict: Verdict) -> None:
         """The channel has resolved frames, those of each sender in the order in which they were sent."""
@@ -225,25 +217,20 @@ class RealtimeAccounts:
         at, count = np.array(message.agent, np.intp) - 1, len(message.agent)
         for row, slot in enumerate(message.slot.tolist()):
             account = self._account(slot)
-            if account is not None and not account.answered[at].any():  # else too late, or reported twice
+            if not account.answered[at].any():  # else reported twice
                 account.add_report(at, message, row)
                 account.sent[at] = message.length[row * count : (row + 1) * count] > 0
         for slot, sender, here, at_ns, mask in received_in(message):
-            account = self._account(here)
-            if account is not None:
-                receivers = np.zeros(self._agents, np.bool_)
-                receivers[at] = mask
-                account.heard.append((sender, slot, at_ns, receivers))
+            receivers = np.zeros(self._agents, np.bool_)
+            receivers[at] = mask
+            self._account(here).heard.append((sender, slot, at_ns, receivers))
 
     def pop(self, closed: int, at_end: bool) -> list[tuple[int, dict[str, Any]]]:
-        """The fields of records for which nothing is waited for any more, by slot.
-
-        :param closed: last slot that the channel has judged.
-        :param at_end: nothing more will come.
-        """
+        """The fields of records up to the last closed slot for which nothing is waited for any more, by slot."""
         found = []
         while self._next <= closed and (at_end or self._next <= closed - self._wait or self._is_whole(self._next)):
-            account = self._open.pop(self._next, None) or _Account(self._agents, self._steps)
+            account = self._account(self._next)
+            self._open.pop(self._next)
             found.append((self._next, self._fields(self._next, account)))
             self._next += 1
         return found
@@ -283,9 +270,8 @@ def _parameter_event(time_ns: int, node: str, change: Change) -> bytes:
     values = [(name, value) for name, value in change.to_dict().items() if name != "slot"]
     values = [(name, json.dumps(value) if isinstance(value, list) else value) for name, value in values]
     message = CdrBuilder()
-    seconds, nanoseconds = divmod(time_ns, SECOND)
-    message.number("i", seconds)
-    message.number("I", nanoseconds)
+    for code, part in zip("iI", divmod(time_ns, SECOND), strict=True):
+        message.number(code, part)
     message.text(node)
     message.number("I", 0, len(values))  # new_parameters, changed_parameters
     for name, value in values:

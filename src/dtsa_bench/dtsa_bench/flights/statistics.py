@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from dtsa_agent.core.delays import Delays
 from dtsa_agent.ros.common.messages import Fields
@@ -19,31 +18,6 @@ from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 _LAG = 0.25  # of a slot: who hears of a frame later than this decides without it now and then
 _LATE = 0.005  # share of frames, or of entries of reports
 _ON_TIME = 0.95
-
-
-class DeliveryStatistics(ChannelObserver):
-    """How long after its arrival by the channel's time line each receiver took in a frame, as it says itself."""
-
-    def __init__(self, agents: int) -> None:
-        self._agents, self._delays = agents, Delays(agents)
-
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        for taken in answers.receipts or ():
-            receivers = np.flatnonzero(taken.mask)
-            self._delays.add_many(taken.at_ns[receivers] - taken.arrival_ns, receivers)
-
-    def summary(self) -> dict[str, Any]:
-        """The results, ms; None where nothing was heard."""
-
-        def of(series: int | None) -> dict[str, float | None]:
-            delays = self._delays
-            return {
-                "p50": delays.quantile_ms(0.5, series),
-                "p99": delays.quantile_ms(0.99, series),
-                "max": delays.largest_ms(series),
-            }
-
-        return {"delivery_ms": {"all": of(None), **{str(k + 1): of(k) for k in range(self._agents)}}}
 
 
 def channel_summary(channel: RealtimeChannel) -> dict[str, Any]:
@@ -121,46 +95,40 @@ class _Sends:
         return float(np.median(self._kept))
 
 
-class ClockStatistics(ChannelObserver):
-    """Collects when slots start and frames leave, and sums it up."""
+class TimingStatistics(ChannelObserver):
+    """Collects when slots start, frames leave, and receivers have them, as they say themselves, and sums it up."""
 
     def __init__(self, agents: int) -> None:
-        self._slot = np.full(_OPEN, -1, dtype=np.int64)  # each in row slot % _OPEN, -1: none yet
-        self._starts = np.full((_OPEN, agents), np.nan)  # ns, own slot's start, nan: sent, or not known
-        self._sends = np.full((_OPEN, agents), np.nan)  # ns, of the transmission
+        self._agents = agents
+        #: ns by slot, (2, N): starts of the slot of those that kept silent, then transmissions; nan: not known.
+        self._open: dict[int, NDArray[np.float64]] = {}
+        self._last_summed = -1
         self._spreads = 0  # slots that are summed up and of which two agents told their start
         self._spread_sum = self._spread_max = 0.0  # ns, over those
         self._last_spreads: deque[float] = deque(maxlen=_END)  # ns
         self._away: dict[int, _Sends] = {}  # by agent
+        self._delays = Delays(agents)  # by receiver, from a frame's arrival by the channel's time line
+
+    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+        for taken in answers.receipts or ():
+            receivers = np.flatnonzero(taken.mask)
+            self._delays.add_many(taken.at_ns[receivers] - taken.arrival_ns, receivers)
 
     def report(self, message: Fields) -> None:
-        self.add(message.slot, message.agent, message.offset_ns, message.length)
+        """Receive what one process says of some slots; nothing of slots that have been summed up."""
+        slots, at = message.slot.tolist(), np.array(message.agent, dtype=np.intp) - 1
+        sent, offsets_ns = (a.reshape(len(slots), len(at)) for a in (message.length > 0, message.offset_ns))
+        for row, slot in enumerate(slots):
+            if slot in self._open or slot > self._last_summed:
+                known = self._open.setdefault(slot, np.full((2, self._agents), np.nan))
+                known[sent[row].astype(np.intp), at] = offsets_ns[row]
+        while len(self._open) > _OPEN:
+            self._sum_up(next(iter(self._open)))
 
-    def add(
-        self, slot: ArrayLike, ids: Sequence[int], offsets_ns: NDArray[np.int64], lengths: NDArray[np.uint8]
-    ) -> None:
-        """Takes in what one process says of some slots; nothing of slots that have been summed up.
-
-        :param slot: (m,) as its agents count, ascending.
-        :param ids: (n,) ids of the agents.
-        :param lengths: (m n) bytes of each frame, 0: silent.
-        """
-        slots = np.asarray(slot, dtype=np.int64)
-        if not len(slots):
-            return  # a process that ends tells what it has heard since its last slot
-        rows = slots % _OPEN
-        for new in slots[self._slot[rows] < slots].tolist():
-            self._sum_up(new % _OPEN)
-            self._slot[new % _OPEN] = new
-        at = np.ix_(rows, np.asarray(ids, dtype=np.intp) - 1)
-        open_ = (self._slot[rows] == slots)[:, None]
-        silent, offsets = lengths.reshape(len(slots), -1) == 0, offsets_ns.reshape(len(slots), -1)
-        self._starts[at] = np.where(open_ & silent, offsets, self._starts[at])
-        self._sends[at] = np.where(open_ & ~silent, offsets, self._sends[at])
-
-    def _sum_up(self, row: int) -> None:
+    def _sum_up(self, slot: int) -> None:
         """Nothing more will be told of a slot."""
-        starts, sends = self._starts[row], self._sends[row]
+        self._last_summed = max(self._last_summed, slot)
+        starts, sends = self._open.pop(slot)
         usable = np.sort(starts[~np.isnan(starts)])
         count = len(usable)
         if count > 1:
@@ -172,7 +140,6 @@ class ClockStatistics(ChannelObserver):
         for index in np.flatnonzero(~np.isnan(sends)).tolist() if count else ():
             median = (usable[(count - 1) // 2] + usable[count // 2]) / 2
             self._away.setdefault(index + 1, _Sends()).add(float(sends[index] - median))
-        starts[:] = sends[:] = np.nan
 
     def summary(self) -> dict[str, Any]:
         """The results; None where nothing was reported.
@@ -180,12 +147,19 @@ class ClockStatistics(ChannelObserver):
         ``clock_spread_*_ms``: between the first and the last agent's start of the same slot, over all slots, and the
         largest of the last 50; ``send_offset_ms``: by agent, how far its frames left from the swarm's common time (the
         median of the slot's starts; beyond 4096 frames the median is that of evenly spread ones);
-        ``sends_on_time_share``: frames within 1 ms of it.
+        ``sends_on_time_share``: frames within 1 ms of it; ``delivery_ms``: how long after its arrival by the channel's
+        time line receivers took in a frame.
         """
-        for row in np.argsort(self._slot).tolist():
-            self._sum_up(row)
+        for slot in sorted(self._open):
+            self._sum_up(slot)
         frames = sum(sends.count for sends in self._away.values())
+        delays, receivers = self._delays, {"all": None, **{str(k + 1): k for k in range(self._agents)}}
         return {
+            "delivery_ms": {
+                name: {"p50": delays.quantile_ms(0.5, k), "p99": delays.quantile_ms(0.99, k),
+                       "max": delays.largest_ms(k)}
+                for name, k in receivers.items()
+            },
             "clock_spread_max_ms": self._spread_max / 1e6 if self._spreads else None,
             "clock_spread_mean_ms": self._spread_sum / self._spreads / 1e6 if self._spreads else None,
             "clock_spread_end_ms": max(self._last_spreads) / 1e6 if self._spreads else None,
@@ -194,4 +168,4 @@ class ClockStatistics(ChannelObserver):
                 str(agent): {"median": sends.median() / 1e6, "max": sends.largest / 1e6}
                 for agent, sends in sorted(self._away.items())
             },
-        }
+        }  # fmt: skip

@@ -78,10 +78,7 @@ class RealtimeSupervisor(ChannelObserver):
             self._print(f"{agent_names([start.agent])} is started")
 
     def _report_end(self, child: Child) -> None:
-        """Takes note that a process has ended.
-
-        :raises NodeError: when no agent is left.
-        """
+        """Take note that a process has ended; NodeError: no agent is left."""
         left = not child.process.returncode
         self._print(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
         for agent in child.agents:
@@ -93,45 +90,38 @@ class RealtimeSupervisor(ChannelObserver):
             raise NodeError(f"no agent is left: {describe_end(child)}")
 
     def _restart(self, child: Child) -> None:
-        """Starts the program of some agents again; their vehicles have gone on hovering where they were."""
+        """Start the program of some agents again; their vehicles have gone on hovering where they were."""
         places = [value for agent in child.agents for value in self._channel.last_place(agent)]
         self._children.restart(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
         self._print(f"{child.name} is started again")
 
     def follow_parameters(self, node: Node) -> None:
         """Let parameters of the channel's node kill and start the processes of agents, as faults would."""
-        acts = {"kill": self._kill, "start": self._start}
-        for name in acts:
+        for name in ("kill", "start"):
             node.declare_parameter(name, 0, ParameterDescriptor(description=f"id of an agent to {name} now"))
 
         def apply(parameters: list[Parameter]) -> SetParametersResult:
             try:
                 for parameter in parameters:
-                    if parameter.name in acts:
-                        acts[parameter.name](parameter.value)
+                    if parameter.name in ("kill", "start"):
+                        self._kill_or_start(parameter.value, kill=parameter.name == "kill")
             except ConfigError as error:
                 return SetParametersResult(successful=False, reason=str(error))
             return SetParametersResult(successful=True)
 
         node.add_on_set_parameters_callback(apply)
 
-    def _kill(self, agent: int) -> None:
-        child = self._child(agent)
-        if child is None or child.process.poll() is not None:
-            raise ConfigError("agent", f"cf{agent}", "one whose process runs")
-        child.process.kill()
-
-    def _start(self, agent: int) -> None:
-        child = self._child(agent)
-        if child is None or child.process.poll() is None:
-            raise ConfigError("agent", f"cf{agent}", "one whose process has ended")
+    def _kill_or_start(self, agent: int, kill: bool) -> None:
+        child = next((child for child in self._children.all if agent in child.agents), None)
+        if child is None or child.has_ended == kill:
+            raise ConfigError("agent", f"cf{agent}", f"one whose process {'runs' if kill else 'has ended'}")
+        if kill:
+            child.process.kill()
+            return
         check_joinable(self._measurement.metrics.run.swarm.policy)
         self._dead = [entry for entry in self._dead if entry[1] is not child]
         self._measurement.metrics.awaited.update(child.agents)
         self._restart(child)
-
-    def _child(self, agent: int) -> Child | None:
-        return next((child for child in self._children.all if agent in child.agents), None)
 
     def agents_back(self, agents: list[int]) -> None:
         again = "" if self._new.issuperset(agents) else " again"
@@ -139,6 +129,6 @@ class RealtimeSupervisor(ChannelObserver):
         self._print(f"{agent_names(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
 
     def agent_silent(self, agent: int) -> None:
-        known = {agent for child in self._children.all if child.process.poll() is not None for agent in child.agents}
+        known = {agent for child in self._children.all if child.has_ended for agent in child.agents}
         if agent not in known | {start.agent for start in self._late}:
             self._print(f"{agent_names([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")

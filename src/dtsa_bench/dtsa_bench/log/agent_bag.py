@@ -28,7 +28,7 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import pack_received
+from dtsa_agent.ros.common.cdr import pack_received, split_frames
 from dtsa_bench.log.arrays import NEW
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
@@ -41,7 +41,6 @@ from dtsa_bench.log.record import (
     FORMAT_KEY,
     SLOT_RECORD,
     TYPE,
-    cut_frames,
     frame_fields,
     pack_record,
 )
@@ -371,7 +370,7 @@ def _add_slot(bag: AgentBag, message: Any) -> None:
     stamp = message.header.stamp
     start_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) - names.TIME_ZERO_NS + bag.zero_ns
     (presence,), is_sent = message.presence.tolist(), len(message.sender) > 0
-    frames = cut_frames(message.heard_data, message.heard_length, len(message.heard_sender))
+    frames = split_frames(message.heard_data, message.heard_length.tolist())
     is_before = message.heard_before.tolist() or [0] * len(frames)
     columns = zip(message.heard_sender.tolist(), message.heard_slot.tolist(), message.heard_ns.tolist(), frames, strict=True)
     heard = [ReceivedFrame(sender, slot, start_ns + at_ns, data, True) for sender, slot, at_ns, data in columns]

@@ -149,7 +149,7 @@ class _Viewer:
         self._markers = bag.add_topic(f"{names.SWARM}/{names.MARKERS}", "visualization_msgs/msg/MarkerArray")
         spaces = [names.agent_namespace(agent) for agent in range(1, config.agents + 1)]
         self._odometry = [bag.add_topic(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
-        self._packer = OdometryPacker([names.body_frame(space) for space in spaces], names.FRAME)
+        self._packer = OdometryPacker([names.body_frame(space) for space in spaces])
         self._shown: tuple[int, ...] = ()
         self._marker_packer = MarkerPacker([])
 
@@ -163,8 +163,8 @@ class _Viewer:
         for agent in ids:
             self._bag.write(self._odometry[agent - 1], packed[agent - 1], at_ns, at_ns)
         if ids != self._shown:
-            self._marker_packer, self._shown = MarkerPacker([f"cf{agent}" for agent in ids], ids=ids), ids
-            self._bag.write(self._markers, MarkerPacker.nothing(names.FRAME), at_ns, at_ns)
+            self._marker_packer, self._shown = MarkerPacker(ids), ids
+            self._bag.write(self._markers, MarkerPacker.nothing(), at_ns, at_ns)
         if ids:
             sent = log.sent[row]
             state = np.where(sent[here], COLLIDED if sent.sum() > 1 else SENDING, WAITING).astype(np.uint8)

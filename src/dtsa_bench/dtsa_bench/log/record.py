@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import pack_received, unpack_received
+from dtsa_agent.ros.common.cdr import pack_received, split_frames, unpack_received
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
@@ -122,22 +121,19 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
     if not isinstance(agents, int) or not 0 < agents <= 65535:
         raise UnusableBag(bag.given, "its configuration does not say how many agents there are")
     slot_ns = round(float(slot_ms) * 1e6) if isinstance(slot_ms, (int, float)) and slot_ms > 0 else 10_000_000
-    found = list(records)
     try:
         is_whole = merged is None and not {AGENT, SNIFFER} & set(bag.custom_data)
-        log = _Rows(found, agents, slot_ns, is_whole).log(_name(bag), settings)
+        log = _make_log(list(records), agents, slot_ns, is_whole, _name(bag), settings)
+        log.file, log.version, log.merged = bag.path, bag.custom_data.get("version", ""), merged
+        if RECOVERED_FROM in bag.custom_data:
+            log.notes.append("This bag was recovered: its recorder was killed or its file was damaged.")
+        return log if merged is None else split_log(log, merged["common_slot"])
     except (ValueError, IndexError, TypeError) as error:
         raise UnusableBag(bag.given, f"its slot records do not fit together ({error})") from None
-    log.file, log.version = bag.path, bag.custom_data.get("version", "")
-    if RECOVERED_FROM in bag.custom_data:
-        log.notes.append("This bag was recovered: its recorder was killed or its file was damaged.")
-    if merged is None:
-        return log
-    log.merged = merged
-    try:
-        return split_log(log, int(merged["common_slot"]))
-    except ValueError as error:
-        raise UnusableBag(bag.given, str(error)) from None
+
+
+_LISTS = "missing", "broken_off", "not_on_the_time_line", "nothing_written", "not_determined", "processes"
+_MERGED_KINDS = {"common_slot": int, "frames_heard_not_as_sent": int, **dict.fromkeys(_LISTS, list)}
 
 
 def _merged(bag: Bag) -> dict[str, Any] | None:
@@ -149,15 +145,10 @@ def _merged(bag: Bag) -> dict[str, Any] | None:
         return None
     try:
         about = json.loads(bag.custom_data[MERGED_FROM])
-        if not isinstance(about["common_slot"], int) or about["common_slot"] < 0:
-            raise ValueError("common_slot")
-        for key in ("missing", "broken_off", "not_on_the_time_line", "nothing_written", "not_determined", "processes"):
-            if not isinstance(about[key], list):
-                raise ValueError(key)
-        if not all(isinstance(about["residual_us"][key], float) for key in ("p50", "p99")):
-            raise ValueError("residual_us")
-        if not isinstance(about["frames_heard_not_as_sent"], int):
-            raise ValueError("frames_heard_not_as_sent")
+        wrong = [name for name, kind in _MERGED_KINDS.items() if not isinstance(about[name], kind)]
+        wrong += [name for name in ("p50", "p99") if not isinstance(about["residual_us"][name], float)]
+        if wrong or about["common_slot"] < 0:
+            raise ValueError(", ".join(wrong) or "common_slot")
     except (ValueError, KeyError, TypeError) as error:
         raise UnusableBag(bag.given, f"what it says of the bags it was merged from cannot be read ({error})") from None
     return dict(about)
@@ -171,147 +162,100 @@ def _name(bag: Bag) -> str:
     return directory.parent.name if directory.name == "bag" else directory.name
 
 
-class _Rows:
-    """Puts records into arrays.
+# Fields by agent or sender, whatever their other axes; those that may be empty.
+_BY_AGENT = (*DECIDED, *VECTORS, "track", "offset_ns", "presence")
+_BY_SENDER, _MAY_BE_EMPTY = ("length", "lost", "collided", "sent_ns"), {"offset_ns", "presence", "sent_ns"}
+
+
+def _make_log(
+    records: Sequence[Any], agents: int, slot_ns: int, is_whole: bool, name: str, settings: dict[str, Any]
+) -> FlightLog:
+    """Put records into arrays.
 
     :raises ValueError: if they do not fit together.
     """
-
-    def __init__(self, records: Sequence[Any], agents: int, slot_ns: int, is_whole: bool) -> None:
-        slots = [int(record.slot) for record in records]
-        self.agents, self.slot_ns = agents, slot_ns
-        self._first = 0 if is_whole else min(slots, default=0)
-        last = max(slots, default=-1)
-        if last - self._first > 2 * len(slots) + 1000 or len(set(slots)) < len(slots):
-            raise ValueError("most slots are missing, or a number is damaged")
-        end = None
-        if records and is_whole:  # the last one says where all are at the end, and may say no more
-            end = max(records, key=lambda record: int(record.slot))
-        steps = max((int(record.steps) for record in records), default=1)
-        self._arrays = empty_arrays(last - self._first + (end is None), agents, steps, slot_ns)
-        self._frames: dict[tuple[int, int], bytes] = {}  # by row and sender
-        self._received: dict[tuple[int, int], NDArray[np.bool_]] = {}
-        self._heard: list[tuple[int, int, int, int, NDArray[np.bool_], bool, bytes]] = []
-        self._has_presence = self._own_clocks = False
-        told = [record for record in records if record is not end]
-        everybody = np.arange(1, agents + 1)
-        whole = [record for record in told if np.array_equal(record.agent, everybody)]
-        self._add_accounts(whole, slice(None))
-        for record in told:
-            if not np.array_equal(record.agent, everybody):
-                self._add_accounts([record], self._columns(record))
-            row = int(record.slot) - self._first
-            self._add_frames(record, row)
-            self._add_received(record, row)
-        if end is not None:
-            self._end(end)
-        self.has_end = end is not None
-
-    def _columns(self, record: Any) -> NDArray[np.intp]:
-        index = np.asarray(record.agent, np.intp) - 1
-        if len(index) and (index[0] < 0 or index[-1] >= self.agents or (np.diff(index) <= 0).any()):
-            raise ValueError(f"slot {record.slot}: agents {record.agent.tolist()}")
-        return index
-
-    def _end(self, record: Any) -> None:
-        at = self._columns(record)
-        track = self._arrays["track"]
-        track[int(record.slot) - self._first][:, :, at] = record.track.reshape(track.shape[1], 3, len(at))
-
-    def _add_accounts(self, records: Sequence[Any], at: Any) -> None:
-        """What agents, in these columns, told of slots."""
-        if not records:
-            return
-        arrays, count, steps = self._arrays, len(records[0].agent), self._arrays["track"].shape[1]
-        rows = np.array([int(record.slot) - self._first for record in records])
-
-        def fill(name: str, shape: tuple[int, ...], index: Any) -> None:
-            size = math.prod(shape)
-            values = [getattr(record, name) for record in records]
-            for record, found in zip(records, values, strict=True):
-                if len(found) != size:
-                    raise ValueError(f"slot {record.slot}: {len(found)} entries in {name}, {count} agents")
-            arrays[name][index] = np.concatenate(values).reshape(len(rows), *shape)
-
-        own = (rows, at) if isinstance(at, slice) else (rows[:, None], at)
-        arrays["recorded"][rows], arrays["known"][own] = True, True
-        arrays["outcome"][rows] = [min(int(record.outcome), UNKNOWN) for record in records]
-        stamps = [(int(record.header.stamp.sec), int(record.header.stamp.nanosec)) for record in records]
-        arrays["start_ns"][rows] = [sec * _SECOND + ns - names.TIME_ZERO_NS for sec, ns in stamps]
-        for name in DECIDED:
-            fill(name, (count,), own)
-        planes = (rows, slice(None), at) if isinstance(at, slice) else (rows[:, None, None], np.arange(3)[:, None], at)
-        for name in VECTORS:
-            fill(name, (3, count), planes)
-        for row, record in zip(rows.tolist(), records, strict=True):
-            arrays["track"][row][:, :, at] = record.track.reshape(steps, 3, count)
-            if len(record.offset_ns):
-                arrays["offset_ns"][row, at] = record.offset_ns
-            arrays["presence"][row, at] = record.presence if len(record.presence) else PRESENT
-            self._has_presence = self._has_presence or len(record.presence) > 0
-
-    def _add_frames(self, record: Any, row: int) -> None:
-        arrays, senders = self._arrays, record.sender.tolist()
-        if senders != sorted(set(senders)) or (senders and not 1 <= senders[0] <= senders[-1] <= self.agents):
-            raise ValueError(f"slot {record.slot}: senders {senders}")
-        frames = cut_frames(record.data, record.length, len(senders))
-        columns = np.array(senders, np.intp) - 1
-        for name in ("lost", "collided"):
-            arrays[name][row, columns] = getattr(record, name)
-        arrays["length"][row, columns] = record.length
-        if len(record.sent_ns):
-            self._own_clocks = True
-            arrays["sent_ns"][row, columns] = record.sent_ns
-        received = np.zeros((len(senders), self.agents), np.bool_)
-        if len(record.received):
-            received[:] = unpack_received(record.received.tobytes(), len(senders), self.agents)
-        for sender, data, mask in zip(senders, frames, received, strict=True):
-            if not data:
-                raise ValueError(f"slot {record.slot}: an empty frame of cf{sender}")
-            self._frames[row, sender], self._received[row, sender] = data, mask
-
-    def _add_received(self, record: Any, row: int) -> None:
-        count = len(record.heard_sender)
-        self._own_clocks = self._own_clocks or count > 0 or len(record.offset_ns) > 0
-        if not count:
-            return
-        by = unpack_received(record.heard_by.tobytes(), count, self.agents).astype(np.bool_)
-        before = record.heard_before if len(record.heard_before) else np.zeros(count, np.uint8)
-        data = cut_frames(record.heard_data, record.heard_length, count) if len(record.heard_length) else [b""] * count
-        times = (record.heard_ns + self._arrays["start_ns"][row]).tolist()
-        columns = record.heard_sender.tolist(), record.heard_slot.tolist(), times, by, before.tolist(), data
-        for sender, slot, time_ns, mask, early, frame in zip(*columns, strict=True):
-            self._heard.append((row, sender, slot, time_ns, mask, bool(early), frame))
-
-    def log(self, name: str, settings: dict[str, Any]) -> FlightLog:
-        """The log."""
-        arrays, keys = self._arrays, sorted(self._frames)
-        received = np.array([self._received[key] for key in keys], np.bool_).reshape(len(keys), self.agents)
-        self._own_clocks = self._own_clocks or settings.get("mode") == names.MODES[1]
-        heard = self._received_frames() if self._own_clocks else None
-        presence, sent_ns = arrays.pop("presence"), arrays.pop("sent_ns")
-        return FlightLog(
-            name=name, settings=settings, agents=self.agents, slot_ns=self.slot_ns,
-            data=b"".join([self._frames[key] for key in keys]), received=received, heard=heard,
-            presence=presence if self._has_presence else None, sent_ns=sent_ns if self._own_clocks else None,
-            first_slot=self._first, has_end=self.has_end, **arrays,
-        )  # fmt: skip
-
-    def _received_frames(self) -> ReceivedFrames:
-        frames = [
-            data or self._frames.get((slot - self._first, sender), b"")
-            for _, sender, slot, _, _, _, data in self._heard
-        ]
-        columns = list(zip(*self._heard, strict=True)) if self._heard else [()] * 7
-        numbers = [np.array(column, np.int64) for column in columns[:4]]
-        by = np.array(columns[4], np.bool_).reshape(len(frames), self.agents)
-        return ReceivedFrames(*numbers, by, np.array(columns[5], np.bool_), frames)
+    slots = [int(record.slot) for record in records]
+    first, last = 0 if is_whole else min(slots, default=0), max(slots, default=-1)
+    if last - first > 2 * len(slots) + 1000 or len(set(slots)) < len(slots):
+        raise ValueError("most slots are missing, or a number is damaged")
+    # The last one of a flight says where all are at the end, and may say no more.
+    has_end = is_whole and bool(slots)
+    steps = max((int(record.steps) for record in records), default=1)
+    arrays = empty_arrays(last - first + (not has_end), agents, steps, slot_ns)
+    frames: dict[tuple[int, int], tuple[bytes, NDArray[np.uint8]]] = {}  # by row and sender: bytes, receivers
+    nothing = np.zeros(0, np.int64)
+    heard, heard_data = [(nothing, nothing, nothing, nothing, np.zeros((0, agents), np.uint8), nothing)], list[bytes]()
+    for record, slot in zip(records, slots, strict=True):
+        row, at, columns = slot - first, _columns(record.agent, agents), _columns(record.sender, agents)
+        if has_end and slot == last:
+            _fill(arrays, record, ("track",), row, at)
+            continue
+        arrays["recorded"][row], arrays["known"][row, at], arrays["presence"][row, at] = True, True, PRESENT
+        arrays["outcome"][row] = min(int(record.outcome), UNKNOWN)
+        time_ns = int(record.header.stamp.sec) * _SECOND + int(record.header.stamp.nanosec)
+        arrays["start_ns"][row] = time_ns - names.TIME_ZERO_NS
+        _fill(arrays, record, _BY_AGENT, row, at)
+        if len(columns):
+            _fill(arrays, record, _BY_SENDER, row, columns)
+            data = split_frames(record.data, record.length.tolist())
+            masks = _unpack_mask(record.received, len(columns), agents)
+            for column, sent, mask in zip(columns.tolist(), data, masks, strict=True):
+                if not sent:
+                    raise ValueError(f"slot {slot}: an empty frame of cf{column + 1}")
+                frames[row, column + 1] = sent, mask
+        if count := len(record.heard_sender):
+            before = record.heard_before if len(record.heard_before) else np.zeros(count, np.uint8)
+            times_ns, by = record.heard_ns + arrays["start_ns"][row], _unpack_mask(record.heard_by, count, agents)
+            heard.append((np.full(count, row), record.heard_sender, record.heard_slot, times_ns, by, before))
+            lengths = record.heard_length.tolist()
+            heard_data += split_frames(record.heard_data, lengths) if lengths else [b""] * count
+            if {len(values) for values in heard[-1]} != {count}:
+                raise ValueError(f"slot {slot}: frames that were heard")
+    keys = sorted(frames)
+    received = np.array([frames[key][1] for key in keys], np.bool_).reshape(len(keys), agents)
+    own_clocks = (
+        settings.get("mode") == names.MODES[1]
+        or len(heard) > 1
+        or any(len(record.sent_ns) or len(record.offset_ns) for record in records)
+    )
+    presence, sent_ns = arrays.pop("presence"), arrays.pop("sent_ns")
+    return FlightLog(
+        name=name, settings=settings, agents=agents, slot_ns=slot_ns,
+        data=b"".join([frames[key][0] for key in keys]), received=received, first_slot=first, has_end=has_end,
+        presence=presence if any(len(record.presence) for record in records) else None,
+        sent_ns=sent_ns if own_clocks else None,
+        heard=_received_frames(heard, heard_data, frames, first) if own_clocks else None, **arrays,
+    )  # fmt: skip
 
 
-def cut_frames(data: NDArray[np.uint8], lengths: NDArray[np.uint8], count: int) -> list[bytes]:
-    """Frames that lie one after the other."""
-    if len(lengths) != count or int(lengths.sum(dtype=np.int64)) != len(data):
-        raise ValueError(f"{len(data)} bytes of {count} frames")
-    ends = np.cumsum(lengths, dtype=np.int64).tolist()
-    whole = data.tobytes()
-    return [whole[end - int(length) : end] for end, length in zip(ends, lengths, strict=True)]
+def _columns(ids: NDArray[np.uint16], agents: int) -> NDArray[np.intp]:
+    """The columns of ascending ids."""
+    index = np.asarray(ids, np.intp) - 1
+    if len(index) and (index[0] < 0 or index[-1] >= agents or (np.diff(index) <= 0).any()):
+        raise ValueError(f"ids {ids.tolist()}")
+    return index
+
+
+def _fill(arrays: dict[str, Any], record: Any, fields: Sequence[str], row: int, columns: NDArray[np.intp]) -> None:
+    """Copy fields of a record into the row of a slot."""
+    for name in fields:
+        values, target = getattr(record, name), arrays[name][row]
+        if len(values) or name not in _MAY_BE_EMPTY:
+            at = slice(None) if len(columns) == target.shape[-1] else columns  # of all agents, which is faster
+            target[..., at] = values.reshape(*target.shape[:-1], len(columns))
+
+
+def _unpack_mask(data: NDArray[np.uint8], count: int, agents: int) -> NDArray[np.uint8]:
+    """The mask (count, agents) of a field with a bit an agent; no bits set where it is empty."""
+    return unpack_received(data.tobytes(), count, agents) if len(data) else np.zeros((count, agents), np.uint8)
+
+
+def _received_frames(
+    heard: Sequence[Any], data: Sequence[bytes], frames: Mapping[tuple[int, int], Any], first: int
+) -> ReceivedFrames:
+    """The frames that agents took in; those without bytes of their own are as they were sent."""
+    row, sender, slot, time_ns, by, before = (np.concatenate(column) for column in zip(*heard, strict=True))
+    keys = zip((slot.astype(np.int64) - first).tolist(), sender.tolist(), strict=True)
+    whole = [own or frames.get(key, (b"",))[0] for own, key in zip(data, keys, strict=True)]
+    numbers = (values.astype(np.int64) for values in (row, sender, slot, time_ns))
+    return ReceivedFrames(*numbers, by.astype(np.bool_), before.astype(np.bool_), whole)

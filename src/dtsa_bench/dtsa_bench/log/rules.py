@@ -6,6 +6,7 @@ what was sent, not what was heard.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -14,15 +15,15 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import RemoteProtocolError
 from dtsa_agent.core.frame import decode_extended
 
-_TOLD = 10  # broken rules
-
-
 OPEN = 255
-
-
-def is_anchor(slot: int, agents: int, every: int) -> bool:
-    """Whether a slot is an anchor of its owner: (R + T mod N) mod M = 0; a main one with K M for M."""
-    return (slot // agents + slot % agents) % every == 0
+_MAX_RULES_LISTED = 10
+# Of slots with two senders: given to all who wake; given away by another than the owner; an anchor that its owner gave
+# away before it restarted; a turn that a lessee handed on before it restarted. Any other is PLAIN.
+COLLISIONS = {
+    "open": "two_senders_in_open_turns", "adopted": "two_senders_in_adopted_turns",
+    "anchor": "two_senders_in_anchors_given_away", "handed": "two_senders_in_turns_handed_on",
+}  # fmt: skip
+PLAIN = "plain"
 
 
 @dataclass(slots=True)
@@ -52,23 +53,19 @@ class GrantLedger:
     issued: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # turn -> (issuer, lessee)
     handed: dict[int, HandedTurn] = field(default_factory=dict)  # by turn
     quiet: dict[int, int] = field(default_factory=dict)  # last slot in which each was in probation
-    open_collisions: int = 0  # slots with two senders that had been given to all who wake
-    adopted_collisions: int = 0  # slots with two senders, given away by somebody other than their owner
-    anchor_collisions: int = 0  # ... in an anchor that its owner gave away before it restarted
-    handed_collisions: int = 0  # ... in a turn that a lessee handed on before it restarted
-    plain_collisions: int = 0  # any other slot with two senders
+    collisions: Counter[str] = field(default_factory=Counter)  # slots with two senders, by a key of COLLISIONS or PLAIN
     leased_slots: int = 0
     broken: list[str] = field(default_factory=list)  # rules that were broken, in words
 
     _NEVER: ClassVar[int] = 2**62  # slot
 
-    def _is_anchor(self, slot: int) -> bool:
-        """Whether nobody but its owner may give a slot away."""
-        return is_anchor(slot, self.agents, self.anchor_every)
+    def _is_anchor(self, slot: int, every: int = 0) -> bool:
+        """Whether nobody but its owner may give a slot away: (R + T mod N) mod M = 0."""
+        return (slot // self.agents + slot % self.agents) % (every or self.anchor_every) == 0
 
     def _is_main(self, slot: int) -> bool:
         """Whether a slot is its owner's whatever happens."""
-        return is_anchor(slot, self.agents, self.main_every or self.anchor_every)
+        return self._is_anchor(slot, self.main_every)
 
     def _turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
         """The turns that the lease bytes of a frame speak of, in order.
@@ -93,14 +90,13 @@ class GrantLedger:
         adopted = any(issuer != owner for issuer, _ in given)
         self.leased_slots += bool(given) and not is_open and not adopted
         if len(frames) > 1:
-            self.open_collisions += is_open
-            self.adopted_collisions += adopted and not is_open
-            reclaimed = not is_open and not adopted and self._is_reclaimed(slot, frames.get(owner))
-            forgotten = not is_open and not adopted and any(self._has_forgotten(handed, sender) for sender in frames)
-            self.anchor_collisions += reclaimed
-            self.handed_collisions += forgotten and not reclaimed
-            if not (is_open or adopted or reclaimed or forgotten):
-                self.plain_collisions += 1
+            cause = (
+                "open" if is_open else "adopted" if adopted
+                else "anchor" if self._is_reclaimed(slot, frames.get(owner))
+                else "handed" if any(self._has_forgotten(handed, sender) for sender in frames) else PLAIN
+            )  # fmt: skip
+            self.collisions[cause] += 1
+            if cause == PLAIN:
                 self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}, by now to {handed.holders}")
         for sender, data in frames.items():
             self._check_sender(slot, sender, owner, given, data, handed)
@@ -214,8 +210,10 @@ class RuleChecker:
             for agent, data in (unsent or {}).items():
                 self._ledger.note_frame(slot, agent, self._config.protocol_part(data))
             found, self._ledger.broken = self._ledger.broken, []
-        else:
-            found = self._turns(slot, frames)
+        else:  # in fixed turns
+            owner, fixed = slot % self._config.agents + 1, self._config.policy == "tdma"
+            others = [agent for agent in frames if fixed and agent != owner]
+            found = [f"slot {slot}: agent {agent} sends in a turn of {owner}" for agent in others]
         if unrecorded:
             self._known_from = slot + self._window
         if slot < self._from:
@@ -228,13 +226,6 @@ class RuleChecker:
         self.double_slots += len(frames) > 1
         self.broken += found
 
-    def _turns(self, slot: int, frames: Mapping[int, bytes]) -> list[str]:
-        """With a policy of fixed turns, who has sent out of turn; with others nobody can."""
-        owner = slot % self._config.agents + 1
-        if self._config.policy != "tdma":
-            return []
-        return [f"slot {slot}: agent {agent} sends in a turn of {owner}" for agent in frames if agent != owner]
-
     @property
     def has_rules(self) -> bool:
         """Whether the policy has rules that frames alone can break."""
@@ -242,19 +233,13 @@ class RuleChecker:
 
     def summary(self) -> dict[str, Any]:
         """What was found."""
-        ledger = self._ledger
-        shared = {} if ledger is None else {
-            "two_senders_in_open_turns": ledger.open_collisions,
-            "two_senders_in_adopted_turns": ledger.adopted_collisions,
-            "two_senders_in_anchors_given_away": ledger.anchor_collisions,
-            "two_senders_in_turns_handed_on": ledger.handed_collisions,
-        }  # fmt: skip
+        counts = self._ledger.collisions if self._ledger is not None else None
         return {
             "slots_judged": self.slots,
             "slots_not_judged": self.unchecked,
             "frames_judged": self.frames,
             "slots_with_two_senders": self.double_slots,
-            **shared,
+            **({name: counts[cause] for cause, name in COLLISIONS.items()} if counts is not None else {}),
             "rules_broken": len(self.broken),
-            "which": self.broken[:_TOLD],
+            "which": self.broken[:_MAX_RULES_LISTED],
         }

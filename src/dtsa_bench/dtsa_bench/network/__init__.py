@@ -1,4 +1,1 @@
-"""Agents on a real network: their flight and its record, and a listener that judges what is on the air.
-
-It imports `log` and `runs`.
-"""
+"""Agents on a real network: their flight and its record, and a listener that judges what is on the air."""

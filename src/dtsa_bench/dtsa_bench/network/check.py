@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -48,10 +48,8 @@ class _OtherAgent:
     left: bool = False  # has announced that it leaves: its check is over
     new: bool = True  # on probation: it sends at its anchors only, or in turns of which others need not know yet
     expected: set[int] = field(default_factory=set)  # slots in which it was to send
-    came: set[int] = field(default_factory=set)  # slots of its frames
-    in_time: set[int] = field(default_factory=set)
-    delays_ns: list[int] = field(default_factory=list)
-    hears_count: dict[int, int] = field(default_factory=dict)  # by id: how often it announced that, less not
+    delays_ns: dict[int, int] = field(default_factory=dict)  # of its frames, by slot
+    hears_count: Counter[int] = field(default_factory=Counter)  # by id: how often it announced that, less not
 
     def hears(self, agent: int) -> bool | None:
         """Whether it hears another one: what it announced more often, for others may end their check before it."""
@@ -64,7 +62,7 @@ class Check:
     def __init__(self, agent: int, config: SwarmConfig, port: PortProperties) -> None:
         self._agent, self._config = agent, config
         self._datagrams = StationSettings(config, link_of(config, port), authenticator(config))
-        self._others: dict[int, _OtherAgent] = {}
+        self._others: dict[int, _OtherAgent] = defaultdict(_OtherAgent)
         self._refused: Counter[str] = Counter()
         self._last = -1
         self._slots = 0  # since it began or restarted
@@ -79,31 +77,20 @@ class Check:
         self._slots, self._last = self._slots + 1, record.slot
         if record.chosen not in (0, self._agent):
             self._expects = True
-            other = self._of(record.chosen)
+            other = self._others[record.chosen]
             if self._slots > self._settled and not other.new:
                 other.expected.add(record.slot)
         for frame in (*record.before, *record.heard):
-            other = self._of(frame.sender)
-            other.came.add(frame.slot)
-            delay = frame.arrival_ns - record.start_ns - (frame.slot - record.slot) * self._config.slot_ns
-            other.delays_ns.append(delay)
-            if delay <= (1.0 - BETWEEN) * self._config.slot_ns:
-                other.in_time.add(frame.slot)
-            self._read(other, frame.datagram)
-
-    def _of(self, agent: int) -> _OtherAgent:
-        return self._others.setdefault(agent, _OtherAgent())
-
-    def _read(self, other: _OtherAgent, datagram: bytes) -> None:
-        """Note whether the sender is new, and which agents it announces to hear."""
-        parsed = self._datagrams.read(datagram)
-        other.left, _, other.new = condition_in(parsed.frame)
-        if other.left or not self._datagrams.names:  # an agent that leaves need hear nobody
-            return
-        for agent in range(1, self._config.agents + 1):
-            hears = self._datagrams.hears(parsed.names, agent)
-            if agent != parsed.sender and hears is not None:
-                other.hears_count[agent] = other.hears_count.get(agent, 0) + (1 if hears else -1)
+            other = self._others[frame.sender]
+            start_ns = record.start_ns + (frame.slot - record.slot) * self._config.slot_ns
+            other.delays_ns[frame.slot] = frame.arrival_ns - start_ns
+            parsed = self._datagrams.read(frame.datagram)
+            other.left, _, other.new = condition_in(parsed.frame)
+            for agent in range(1, self._config.agents + 1):
+                # An agent that leaves need hear nobody.
+                hears = self._datagrams.hears(parsed.names, agent) if self._datagrams.names else None
+                if hears is not None and agent != parsed.sender and not other.left:
+                    other.hears_count[agent] += 1 if hears else -1
 
     def refused(self, reason: str, data: bytes, arrival_ns: int) -> None:
         """A datagram was not accepted."""
@@ -129,15 +116,17 @@ class Check:
 
     def _describe(self, agent: int) -> dict[str, Any]:
         other = self._others.get(agent, _OtherAgent())
-        counted = {slot for slot in other.expected if slot <= max(other.came, default=-1)}  # until it ended its check
-        delays = [delay / 1e6 for delay in other.delays_ns]
+        delays = other.delays_ns
+        in_time = {slot for slot, delay in delays.items() if delay <= (1.0 - BETWEEN) * self._config.slot_ns}
+        counted = {slot for slot in other.expected if slot <= max(delays, default=-1)}  # until it ended its check
+        delays_ms = [delay / 1e6 for delay in delays.values()]
         return {
-            "heard": len(other.came),
+            "heard": len(delays),
             "expected": len(counted),
-            "heard_share": len(counted & other.came) / len(counted) if counted else None,
-            "in_time_share": len(counted & other.in_time) / len(counted) if counted else None,
-            "delay_ms": {"p50": statistics.median(delays), "max": max(delays)} if delays else None,
-            "silent_slots": 0 if other.left or not other.came else self._last - max(other.came),
+            "heard_share": len(counted & delays.keys()) / len(counted) if counted else None,
+            "in_time_share": len(counted & in_time) / len(counted) if counted else None,
+            "delay_ms": {"p50": statistics.median(delays_ms), "max": max(delays_ms)} if delays else None,
+            "silent_slots": 0 if other.left or not delays else self._last - max(delays),
             "hears_this_agent": other.hears(self._agent),
             "does_not_hear": sorted(k for k in other.hears_count if not other.hears(k) and k != self._agent),
         }
@@ -172,8 +161,8 @@ def table(result: dict[str, Any]) -> str:
             {True: "yes", False: "no", None: "-"}[row["hears_this_agent"]],
             ", ".join(f"cf{k}" for k in row["does_not_hear"]) or "-",
         ))  # fmt: skip
-    widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
-    lines = ["  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
     about = f"cf{result['id']}: {result['agents']} agents, slots of {result['slot_ms']:g} ms, {result['slots']} slots"
     refused = "; ".join(f"{count} {reason}" for reason, count in result["not_taken_in"].items())
     return "\n".join([about, *lines, *([f"not taken in: {refused}"] if refused else [])]) + "\n"

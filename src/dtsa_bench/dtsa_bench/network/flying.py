@@ -32,9 +32,8 @@ class AgentJob:
 
 
 def check(job: AgentJob, seconds: float) -> int:
-    """Flies with the vehicle held, and prints who is heard, and by whom.
+    """Fly with the vehicle held, for seconds (0: as long as it takes), and print who is heard, and by whom.
 
-    :param seconds: how long; 0: as long as it takes.
     :raises ConfigError: for a port or an id that cannot be used.
     """
     from .check import Check, HeldVehicle, lasts_s, table
@@ -61,10 +60,9 @@ def fly(job: AgentJob) -> int:
     """
     failure = ""
     terminal = _Terminal(job.own.id)
+    show = terminal.show if sys.stderr.isatty() else None
     with Stop() as stop, open_port(job.port) as port:
-        agent = LiveAgent(
-            job.own, job.config, port, log=terminal.log, show=terminal.show if sys.stderr.isatty() else None
-        )
+        agent = LiveAgent(job.own, job.config, port, log=terminal.log, show=show)
         if job.out is None:
             agent.run(stop)
             summary = agent.summary()
@@ -81,9 +79,8 @@ def fly(job: AgentJob) -> int:
     not_taken_in = summary["not_taken_in"]
     # Two: this agent, and all others.
     hearing = counts_of_datagrams(2, summary["slots"], summary["sent"], summary["heard"], not_taken_in)
-    problem = hearing.problem(not_taken_in) if hearing.delivered else ""  # who is alone hears nobody
-    problem = problem or summary["never_flew"]
-    if problem:
+    heard_too_little = hearing.problem(not_taken_in) if hearing.delivered else ""  # who is alone hears nobody
+    if problem := heard_too_little or summary["never_flew"]:
         terminal.log(problem)
     if failure:
         from dtsa_bench.log.bag.errors import BagError

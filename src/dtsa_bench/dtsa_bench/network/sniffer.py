@@ -59,10 +59,7 @@ class Sniffer:
             raise
 
     def run(self, stop: Stop, seconds: float = 0.0) -> None:
-        """Listens until a signal comes, or for a time.
-
-        :param seconds: how long; 0: without end.
-        """
+        """Listen until a signal comes, or for seconds (0: without end)."""
         end = time.monotonic() + seconds
         while not stop and not (seconds and time.monotonic() >= end):
             select.select([self._listener], [], [], _PATIENCE_S)
@@ -72,7 +69,11 @@ class Sniffer:
             self._close_slot(slot)
 
     def _receive(self, data: bytes, arrival_ns: int) -> None:
-        sender, slot, reason = self._read(data)
+        reason, sender, slot, *_ = self._datagrams.read(data)
+        if not reason and slot <= self._judged:  # of a group that lies behind, or the same frame once more
+            reason = OTHER_TIME
+        if not reason and sender in self._slots.get(slot, {}):
+            reason = REPEATED
         if reason:
             self.refused[reason] += 1
             return
@@ -96,15 +97,6 @@ class Sniffer:
                 self._config.auth_session or 1, slot, at, self._config.steps, outcome, **frame_fields(frames, None),
                 sent_ns=[at_ns - first_ns for at_ns, _ in heard.values()], lost=nothing, collided=nothing,
             ))  # fmt: skip
-
-    def _read(self, data: bytes) -> tuple[int, int, str]:
-        fault, sender, slot, *_ = self._datagrams.read(data)
-        if fault:
-            return 0, 0, fault
-        # Of a group that lies behind, or the same frame once more.
-        if slot <= self._judged:
-            return sender, slot, OTHER_TIME
-        return sender, slot, REPEATED if sender in self._slots.get(slot, {}) else ""
 
     def summary(self) -> dict[str, Any]:
         """What was heard, and what was found."""

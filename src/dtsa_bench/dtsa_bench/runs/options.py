@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,47 +23,35 @@ _TITLES = {"swarm": "the swarm", "channel": "the radio channel", "limits": "the 
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Adds an option for every setting of a run, and `--channel FILE` for what does not fit into one option."""
+    """Add an option for every setting of a run, and `--channel FILE` for what does not fit into one option."""
+    groups: dict[str, Any] = {}
     for section, cls, derived in _SECTIONS:
-        groups: dict[str, Any] = {}
         for setting in settings_of(cls):
             title = setting.group.lower() or _TITLES[section]
             group = groups.get(title) or groups.setdefault(title, parser.add_argument_group(title))
-            _offer(group, setting, section, "", derived)
-        if section == "channel":
-            groups[_TITLES[section]].add_argument(
-                "--channel",
-                metavar="FILE",
-                default=None,
-                help="YAML file with settings of the "
-                "channel, those too that have no option: loss_matrix, link_loss, schedule",
-            )
+            if setting.name not in derived:
+                _add(group, setting, section)
+    text = "YAML file with settings of the channel, those too that have no option: loss_matrix, link_loss, schedule"
+    groups[_TITLES["channel"]].add_argument("--channel", metavar="FILE", default=None, help=text)
 
 
 def add_mode_options(parser: argparse.ArgumentParser) -> Any:
-    """Adds the options of flights in real time; returns their group, for further options."""
+    """Add the options of flights in real time; return their group, for further options."""
     group = parser.add_argument_group("real time")
     add_options(group, RunConfig, "run")
     add_options(group, ClockConfig, "clocks", "clock-", skip=("seed",))
     return group
 
 
-def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "", skip: Iterable[str] = ()) -> None:
-    """Adds an option for every setting of a settings class that fits into one.
+def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "", skip: Collection[str] = ()) -> None:
+    """Add an option for every setting of a settings class that fits into one.
 
-    :param section: what :func:`given` calls these options.
+    :param section: what :func:`given_options` calls these options.
     :param prefix: stands before the setting's name in the option's.
-    :param skip: settings that become no option.
     """
-    left_out = tuple(skip)
     for setting in settings_of(cls):
-        _offer(group, setting, section, prefix, left_out)
-
-
-def _offer(group: Any, setting: Setting, section: str, prefix: str, skip: tuple[str, ...]) -> None:
-    """Adds an option for a setting that fits into one and is not left out."""
-    if setting.kind not in ("structure", "vector") and setting.name not in skip:
-        _add(group, setting, section, prefix)
+        if setting.name not in skip:
+            _add(group, setting, section, prefix)
 
 
 def given_options(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
@@ -71,32 +59,32 @@ def given_options(args: argparse.Namespace, cls: type[Settings], section: str) -
 
     :raises ConfigError: for a text that is no value of its setting's kind.
     """
-    found = {}
-    for setting in settings_of(cls):
-        value = getattr(args, f"{section}.{setting.name}", None)
-        if value is not None:
-            found[setting.name] = setting.parse(value) if isinstance(value, str) else value
-    return found
+    given = ((setting, getattr(args, f"{section}.{setting.name}", None)) for setting in settings_of(cls))
+    return {
+        setting.name: setting.parse(value) if isinstance(value, str) else value
+        for setting, value in given
+        if value is not None
+    }
 
 
-def _add(group: Any, setting: Setting, section: str, prefix: str) -> None:
-    option = f"--{prefix}" + setting.name.replace("_", "-")
-    where = f"{section}.{setting.name}"
-    text = setting.description.replace("%", "%%")
-    if setting.default not in (None, {}, ""):
-        text += f" [{_shown(setting.default)}]"
-    if setting.kind == "bool":
-        group.add_argument(option, dest=where, action=argparse.BooleanOptionalAction, default=None, help=text)
+_PLACEHOLDERS = {"int": "N", "float": "X", "values": "NAME=X,...", "file": "FILE"}
+
+
+def _add(group: Any, setting: Setting, section: str, prefix: str = "") -> None:
+    """Add an option for a setting, if it fits into one."""
+    if setting.kind in ("structure", "vector"):
         return
-    metavar = {"int": "N", "float": "X", "values": "NAME=X,...", "file": "FILE"}.get(
-        setting.kind, "NAME" if setting.choices else "TEXT"
-    )
-    action = group.add_argument(option, dest=where, metavar=metavar, default=None, help=text)
+    text, default = setting.description.replace("%", "%%"), setting.default
+    if default not in (None, {}, ""):
+        text += f" [{f'{default:g}' if isinstance(default, float) else default}]"
+    names = f"--{prefix}" + setting.name.replace("_", "-")
+    options: dict[str, Any] = {"dest": f"{section}.{setting.name}", "default": None, "help": text}
+    if setting.kind == "bool":
+        group.add_argument(names, action=argparse.BooleanOptionalAction, **options)
+        return
+    placeholder = _PLACEHOLDERS.get(setting.kind, "NAME" if setting.choices else "TEXT")
+    action = group.add_argument(names, metavar=placeholder, **options)
     action.words = tuple(str(word) for word in setting.choices)  # for completion; plug-ins have names of their own
-
-
-def _shown(value: object) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def run_config(args: argparse.Namespace, **fixed: Any) -> RunConfig:
@@ -107,10 +95,9 @@ def run_config(args: argparse.Namespace, **fixed: Any) -> RunConfig:
     values = {section: given_options(args, cls, section) for section, cls, _ in _SECTIONS}
     swarm = SwarmConfig.from_dict({**values["swarm"], **fixed})
     derived = from_swarm(swarm)
-    if getattr(args, "channel", None):
-        channel = ChannelConfig.from_yaml(args.channel, **values["channel"], **derived)
-    else:
-        channel = ChannelConfig.from_dict({**values["channel"], **derived})
+    settings = {**values["channel"], **derived}
+    file = getattr(args, "channel", None)
+    channel = ChannelConfig.from_yaml(file, **settings) if file else ChannelConfig.from_dict(settings)
     clocks = ClockConfig(seed=swarm.seed, **given_options(args, ClockConfig, "clocks"))
     limits = RunLimits(**values["limits"])
     return RunConfig(swarm, channel, limits, clocks=clocks, **given_options(args, RunConfig, "run"))
@@ -159,13 +146,13 @@ def named_values(words: Iterable[str]) -> dict[str, Any]:
     return values
 
 
-def check_free(directory: Path) -> None:
+def check_free(directory: Path, name: str = "out") -> None:
     """Whether results can be put there: it does not exist yet, or is an empty directory.
 
-    :raises ConfigError: if it is in use.
+    :raises ConfigError: if it is in use; it names the setting.
     """
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise ConfigError("out", str(directory), "a directory that is empty or does not exist yet")
+        raise ConfigError(name, str(directory), "a directory that is empty or does not exist yet")
 
 
 def new_directory(path: str | Path) -> Path:

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.kernel import lib
-from dtsa_agent.core.plugins.entry_points import PluginSwarm
-from dtsa_agent.core.plugins.kinds import Table
+from dtsa_agent.core.plugins.entry_points import PluginSwarm, Table
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS
 from dtsa_agent.core.settings.flight_models import AVOIDERS
 from dtsa_agent.keys import with_key
@@ -55,21 +54,15 @@ def fields(observations: NDArray[np.float32], agents: int) -> dict[str, NDArray[
 
 
 class Observer:
-    """Observations of one agent that flies as a plug-in: what the environment gives to that agent, bit for bit.
+    """Observations of one agent that flies as a plug-in, bit for bit those that the environment gives to that agent.
 
-    :param config: what the plug-in's factory was given.
-    :param agent: id, as its factory was given it.
+    It is made of what the plug-in's factory was given, and called with what its ``choose`` is given; returns (F,).
     """
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         del config, agent
 
     def __call__(self, table: Table, slot: int) -> NDArray[np.float32]:
-        """(F,) what the agent has heard before a slot.
-
-        :param table: what ``choose`` was given.
-        :param slot: the slot that begins.
-        """
         return table.observation(slot)
 
 
@@ -116,10 +109,7 @@ class Actions:
         del config, agent
 
     def choose(self, table: Table, slot: int) -> int:
-        """Never called: the environment says who sends.
-
-        :raises ConfigError: outside of one.
-        """
+        """Never called in an environment: its actions say which agents send."""
         raise ConfigError("policy", POLICY, "another one: this one flies in dtsa.env only")
 
 
@@ -133,17 +123,10 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
     :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "name": "dtsa_v0", "render_modes": ["ansi", "human"], "is_parallelizable": True,
-    }  # fmt: skip
+    metadata: ClassVar = {"name": "dtsa_v0", "render_modes": ["ansi", "human"], "is_parallelizable": True}
 
     def __init__(
-        self,
-        run: RunConfig,
-        *,
-        reward: Reward | None = None,
-        slots: int | None = None,
-        render_mode: str | None = None,
+        self, run: RunConfig, *, reward: Reward | None = None, slots: int | None = None, render_mode: str | None = None
     ) -> None:
         if ParallelEnv is object:
             raise ConfigError("pettingzoo", None, "an installed PettingZoo (pip install pettingzoo)")

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.kernel import ffi, lib
+from dtsa_agent.core.kernel import ffi, fields_of, lib
 
 MS, S = 1_000_000, 1_000_000_000
 FAULTS = (
@@ -114,21 +114,16 @@ def bound_ns(flight: LiveFlight) -> int:
 
 
 def fly(flight: LiveFlight, observer: Callable[[Any], None] | None = None) -> LiveResult:
-    """Fly, and check.
-
-    :param observer: is told each call of a station, a ``live_call``.
-    """
+    """Fly, and check; ``observer`` gets each call of a station, a ``live_call``."""
     c, kept = _c_flight(flight)
     result = ffi.new("live_result *")
     handle = ffi.new_handle(observer) if observer is not None else ffi.NULL
     if not lib.live_fly(c, result, lib.live_called if observer is not None else ffi.NULL, handle):
         raise MemoryError("a live flight cannot be made")
     del kept
-    return LiveResult(
-        VIOLATIONS[result.violation], result.agent, result.other, result.at_ns,
-        result.together_ns if result.together_ns >= 0 else None, result.hash, result.agent_s, result.sent,
-        result.flown, result.hovered, result.restarts, result.shifts,
-    )  # fmt: skip
+    together_ns = result.together_ns if result.together_ns >= 0 else None
+    values = {field.name: getattr(result, field.name) for field in fields(LiveResult)}
+    return LiveResult(**values | {"violation": VIOLATIONS[result.violation], "together_ns": together_ns})
 
 
 @ffi.def_extern(name="live_called")
@@ -165,22 +160,12 @@ def _c_flight(flight: LiveFlight) -> tuple[Any, list[Any]]:
             "flight_ns": flight.latency_ns + flight.airtime_ns, "trust_ns": MS,
         },
     }  # fmt: skip
-    starts = flight.starts_ns or (0,) * n
-    ppb = 1000 * flight.drift_ppm
+    starts, ppb = (*(flight.starts_ns or (0,) * n), 0, 0), 1000 * flight.drift_ppm
     hosts = [
-        {
-            "start_ns": starts[k] if k < n else 0, "clock_ns": draw.randrange(_CLOCKS_S * S),
-            "drift_ppb": draw.randint(-ppb, ppb),
-        }
-        for k in range(n + 2)
-    ]  # fmt: skip
-    faults = [
-        {
-            "kind": FAULTS.index(fault.kind), "agent": fault.agent, "group": fault.group, "at_ns": fault.at_ns,
-            "lasts_ns": fault.lasts_ns, "amount": fault.amount,
-        }
-        for fault in flight.faults
-    ]  # fmt: skip
+        {"start_ns": start, "clock_ns": draw.randrange(_CLOCKS_S * S), "drift_ppb": draw.randint(-ppb, ppb)}
+        for start in starts
+    ]
+    faults = [fields_of("live_fault", fault, kind=FAULTS.index(fault.kind)) for fault in flight.faults]
     over = max([flight.lasts_ns, *(fault.at_ns + fault.lasts_ns for fault in flight.faults)])
     c = ffi.new("live_flight *", {
         "config": config[0], "station": station, "seed": draw.randrange(1 << 62), "wake_ns": 60_000,
@@ -193,10 +178,7 @@ def _c_flight(flight: LiveFlight) -> tuple[Any, list[Any]]:
 
 
 def draw_flight(seed: int) -> LiveFlight:
-    """Return a flight with anything that can happen to it.
-
-    :raises ConfigError: for a seed that is no whole number from 0 on.
-    """
+    """Return a flight with anything that can happen to it."""
     LiveFlight(seed)
     draw = random.Random(seed)
     agents, slot_ns = draw.choice([2, 3, 4, 5, 6, 8, 12]), draw.choice([5, 10, 10, 20, 33]) * MS
@@ -233,13 +215,8 @@ def _draw_fault(draw: random.Random, flight: LiveFlight) -> LiveFault:
 def shrink(flight: LiveFlight) -> LiveFlight:
     """A simpler flight with the same violation: as few faults, as short, as can be found one step at a time."""
     violation = fly(flight).violation
-    found = True
-    while found:
-        found = False
-        for simpler in _simpler(flight):
-            if fly(simpler).violation == violation:
-                flight, found = simpler, True
-                break
+    while simpler := next((other for other in _simpler(flight) if fly(other).violation == violation), None):
+        flight = simpler
     return flight
 
 
@@ -259,7 +236,7 @@ def _simpler(flight: LiveFlight) -> Iterator[LiveFlight]:
 
 def command_of(flight: LiveFlight) -> str:
     """Return the command that flies a flight again, and prints its result."""
-    return f'python -c "from {__name__} import *; print(fly({_in_words(flight)}))"'
+    return f'python -c "from {__name__} import *; print(fly({flight!r}))"'
 
 
 def report_failure(seed: int) -> str:
@@ -270,12 +247,3 @@ def report_failure(seed: int) -> str:
         return ""
     where = f"{result.violation}, agents {result.agent}, {result.other}, at {result.at_ns / S:.3f} s"
     return f"seed {seed}: {where}; shrunk:\n{command_of(shrink(flight))}"
-
-
-def _in_words(value: object) -> str:
-    if isinstance(value, tuple):
-        return "(" + "".join(_in_words(part) + ", " for part in value) + ")"
-    if not isinstance(value, LiveFlight | LiveFault):
-        return repr(value)
-    given = {one.name: getattr(value, one.name) for one in fields(value) if getattr(value, one.name) != one.default}
-    return f"{type(value).__name__}({', '.join(f'{name}={_in_words(part)}' for name, part in given.items())})"

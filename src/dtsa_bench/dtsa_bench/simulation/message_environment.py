@@ -1,4 +1,4 @@
-"""Environments of others whose agents know of each other what a channel carries (docs/how-to/environments.md)."""
+"""Environments of others whose agents know of each other what a channel carries (docs/how-to/relay.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting
-from dtsa_channel_sim.relay.transport import RadioMessage, Transport, read_settings
+from dtsa_channel_sim.relay.transport import MessageChannel, RadioMessage, Transport
 
 try:
     from gymnasium.spaces import Box, Dict
@@ -52,47 +52,43 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         if BaseParallelWrapper is object:
             raise ConfigError("pettingzoo", None, "an installed PettingZoo (pip install pettingzoo)")
         super().__init__(env)
-        has_parts = space is None and isinstance(messages, Mapping | Callable)
-        if not has_parts and not (messages is None and isinstance(space, Box)):
+        if isinstance(messages, Mapping | Callable) == isinstance(space, Box) or None not in (messages, space):
             raise ConfigError("messages, space", (messages, space), "either messages, or a Box as space")
         self._names: list[str] = list(env.possible_agents)
-        self._access, self._config = read_settings(settings, len(self._names))
+        self._config = MessageChannel.of(settings, len(self._names))
         self._step_ns, self._size = round(_STEP_MS.check(step_ms) * 1e6), _SIZE.check(size)
         self._space, self._positions, self._next_seed = space, positions, self._config.seed
-        if positions is None and (self._config.needs_positions or self._access.access == "error"):
+        if positions is None and (self._config.needs_positions or self._config.access == "error"):
             raise ConfigError("positions", None, "a function that returns where agents are, as the channel needs it")
-        if fault := Transport(self._access, self._config).fault_of(size):
+        if fault := Transport(self._config).fault_of(size):
             raise ConfigError("size", size, f"what can be sent: {fault}")
-        self._others = {name: [other for other in self._names if other != name] for name in self._names}
-        self._spaces = {name: (env.observation_space(name), env.action_space(name)) for name in self._names}
-        self._empty: dict[str, Any] = {}  # the first values known: 0, or the nearest that the space allows
-        self._parts: dict[str, dict[str, Any]] = {}  # numbers of an observation that belong to each other agent
-        for name, (seen, action) in self._spaces.items():
-            box = seen if space is None else space
+        self._spaces: dict[str, tuple[Any, Any]] = {}  # of observations and actions
+        self._parts: dict[str, dict[str, Any]] = {name: {} for name in self._names}  # known, of what others send
+        self._first: dict[str, Any] = {}  # what is known at first: 0, or the nearest values that the space allows
+        for name in self._names:
+            observation, action = env.observation_space(name), env.action_space(name)
+            box = observation if space is None else space
             if not isinstance(box, Box) or (space is None and len(box.shape) != 1):
                 allowed = "a Box of one dimension, or messages with a space"
                 raise ConfigError(f"observation_space({name!r})", box, allowed)
-            self._empty[name] = np.clip(np.zeros(box.shape, box.dtype), box.low, box.high)
-            if messages is None:
-                received = Dict(dict.fromkeys(self._others[name], space))
-                seen = Dict({"observation": seen, "messages": received})
-                self._spaces[name] = seen, Dict({"action": action, "message": space})
-            else:
-                self._parts[name] = self._parts_of(name, messages)
-
-    def _parts_of(self, name: str, messages: MessageMap) -> dict[str, Any]:
-        parts = {}
-        for other in self._others[name]:
-            part = messages(name, other) if callable(messages) else messages.get(name, {}).get(other)
-            if part is None:
-                continue
-            try:
-                parts[other] = part if isinstance(part, slice) else np.asarray(part)
-                self._empty[name][parts[other]]
-            except (IndexError, TypeError, ValueError):
-                allowed = f"a slice or a list of indices below {len(self._empty[name])}"
-                raise ConfigError(f"messages[{name!r}][{other!r}]", part, allowed) from None
-        return parts
+            self._first[name] = np.clip(np.zeros(box.shape, box.dtype), box.low, box.high)
+            for other in [other for other in self._names if other != name]:
+                part: Any = ...
+                if messages is not None:
+                    part = messages(name, other) if callable(messages) else messages.get(name, {}).get(other)
+                if part is None:
+                    continue
+                try:
+                    self._parts[name][other] = part if part is ... or isinstance(part, slice) else np.asarray(part)
+                    self._first[name][self._parts[name][other]]
+                except (IndexError, TypeError, ValueError):
+                    allowed = f"a slice or a list of indices below {len(self._first[name])}"
+                    raise ConfigError(f"messages[{name!r}][{other!r}]", part, allowed) from None
+            if space is not None:
+                received = Dict(dict.fromkeys(self._parts[name], space))
+                observation = Dict({"observation": observation, "messages": received})
+                action = Dict({"action": action, "message": space})
+            self._spaces[name] = observation, action
 
     def observation_space(self, agent: str) -> Any:
         """That of the environment; with a space: a ``Dict`` of its ``observation`` and ``messages`` by agent."""
@@ -108,38 +104,35 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         """Begin an episode; without a seed, that of the losses is one more than in the last episode."""
         self._config = replace(self._config, seed=self._next_seed if seed is None else seed)
         self._next_seed = self._config.seed + 1
-        self._transport, self._step = Transport(self._access, self._config), 0
+        self._transport, self._step = Transport(self._config), 0
         self._newest = np.full((len(self._names), len(self._names)), -1)  # step of each receiver's known values
-        # Payloads known, by receiver and sender: a message, or all observations of a step.
-        self._known: dict[str, dict[str, Any]] = {
-            name: dict.fromkeys(self._others[name], self._empty if self._space is None else self._empty[name])
-            for name in self._names
-        }
+        # What each agent received of others: by receiver and sender, and in it for each receiver.
+        self._known = {name: dict.fromkeys(parts, self._first) for name, parts in self._parts.items()}
         return self._exchange(*self.env.reset(seed=seed, options=options), {})
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
         """Take a step: observations, rewards, terminations, truncations and infos by agent."""
         sent: dict[str, Any] = {}
         if self._space is not None:
-            sent = {name: np.array(action["message"]) for name, action in actions.items()}
-            actions = {name: action["action"] for name, action in actions.items()}
+            sent = {name: dict.fromkeys(self._names, np.array(both["message"])) for name, both in actions.items()}
+            actions = {name: both["action"] for name, both in actions.items()}
         observations, *outcome, infos = self.env.step(actions)
         observations, infos = self._exchange(observations, infos, sent)
         return observations, *outcome, infos
 
     def _exchange(
-        self, observations: dict[str, Any], infos: dict[str, Any], sent: dict[str, Any]
+        self, observations: dict[str, Any], infos: dict[str, Any], sent: dict[str, dict[str, Any]]
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Send the messages of a step, let it pass, and return observations and infos with what was received."""
+        """Let a step's messages, by sender and receiver, pass; return observations and infos with what was received."""
         step, now_ns, names = self._step, self._step * self._step_ns, self._names
         self._step += 1
         if self._space is None:
             copies = {name: np.array(values) for name, values in observations.items()}
-            sent = dict.fromkeys(copies, copies)
+            sent = dict.fromkeys(names, copies)
         present = np.array([name in observations for name in names])
-        for row, name in enumerate(names):
-            if name in sent:
-                self._transport.send(RadioMessage(row + 1, "", step, self._size, now_ns, present, sent[name]))
+        for sender, name in enumerate(names, 1):
+            if name in sent and present[sender - 1]:
+                self._transport.send(RadioMessage(sender, "", step, self._size, now_ns, present, sent[name]))
         for message, received in self._transport.advance(now_ns + self._step_ns, self._places()):
             column = message.sender - 1
             newer = received & (self._newest[:, column] < message.number)
@@ -148,12 +141,13 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
                 self._known[names[row]][names[column]] = message.payload
         completed: dict[str, Any] = {}
         for name, own in observations.items():
+            known = {other: self._known[name][other][name] for other in self._parts[name]}
             if self._space is not None:
-                completed[name] = {"observation": own, "messages": dict(self._known[name])}
+                completed[name] = {"observation": own, "messages": known}
                 continue
             completed[name] = np.array(own)
             for other, part in self._parts[name].items():
-                completed[name][part] = self._known[name][other][name][part]
+                completed[name][part] = known[other][part]
         ages = np.where(self._newest < 0, -1, step - self._newest).tolist()
         for name, row in zip(names, ages, strict=True):
             if name in infos:

@@ -52,25 +52,17 @@ class SimulatedFlight:
 
     def summary(self) -> dict[str, Any]:
         """The results, with the keys of ``summary.json``."""
-        result = self.metrics.summary(self.wall_time_s)
-        result["malformed"], result["foreign"] = self.swarm.malformed, self.swarm.foreign
-        return result
+        counts = {"malformed": self.swarm.malformed, "foreign": self.swarm.foreign}
+        return self.metrics.summary(self.wall_time_s) | counts
 
 
 def simulate(
-    run: RunConfig,
-    *,
-    shared_table: bool | None = None,
-    log: bool = False,
-    frames: bool = False,
-    observer: int = 0,
-    slots: int | None = None,
-    changes: Mapping[int, Mapping[str, Any]] | None = None,
+    run: RunConfig, *, shared_table: bool | None = None, log: bool = False, frames: bool = False, observer: int = 0,
+    slots: int | None = None, changes: Mapping[int, Mapping[str, Any]] | None = None,
     progress: Callable[[int], None] | None = None,
-) -> SimulatedFlight:
+) -> SimulatedFlight:  # fmt: skip
     """Flies one run.
 
-    :param run: the run.
     :param shared_table: one table for all agents; None: where :func:`may_share` allows it.
     :param log: keep what happened in every slot.
     :param frames: keep the bytes of frames in it, too.
@@ -112,13 +104,9 @@ def complete_slot(
 
 
 def _fly(
-    swarm: Swarm,
-    channel: Channel,
-    metrics: FlightMetrics,
-    log: SlotWriter | None,
-    slots: int | None,
+    swarm: Swarm, channel: Channel, metrics: FlightMetrics, log: SlotWriter | None, slots: int | None,
     progress: Callable[[int], None] | None,
-) -> None:
+) -> None:  # fmt: skip
     """Fly slots, until the flight is over or a number of them: in C as far as agents and channel are simple."""
     flight, received = ffi.new("sim_flight *"), ffi.new("uint8_t[]", swarm.config.agents)
     flight.swarm, flight.metrics, flight.received = swarm.kernel, metrics.kernel, received
@@ -169,8 +157,7 @@ def _fly_unslotted(
             log.open_slot()
         metrics.compare_tables(slot, swarm.digest, swarm.chosen)
         swarm.fly(slot)
-        arrived = [(slot, frame, mask) for frame, mask in carried.heard]
-        for at, frame, mask in (*arrived, *carried.combined):
+        for at, frame, mask in (*carried.heard, *carried.combined):
             swarm.hear(at, frame, mask)
             if log is not None:
                 accepted.append(AcceptedFrame(slot, at, frame, mask))

@@ -33,8 +33,9 @@ class SlotTraffic:
 
     senders: tuple[int, ...] = ()  # ids that began to send a frame in it, each once
     lengths: list[int] = field(default_factory=list)  # bytes of the packets that began in it
-    heard: list[tuple[bytes, NDArray[np.bool_]]] = field(default_factory=list)  # frames that arrived, and (N,) by whom
-    # Frames that policies have put together from packets: the slot of their state, the frame, and (N,) by whom.
+    # Frames that arrived, or that policies have put together from packets: slot, frame, and (N,) which agents heard it.
+    # The slot is the present one, or that of the state in a frame put together.
+    heard: list[tuple[int, bytes, NDArray[np.bool_]]] = field(default_factory=list)
     combined: list[tuple[int, bytes, NDArray[np.bool_]]] = field(default_factory=list)
     outcome: int = IDLE  # SUCCESS: packets ended in it and none was disturbed; COLLISION: one was
 
@@ -45,16 +46,13 @@ class _Packet(NamedTuple):
     sender: int
     frame: bytes
     note: bytes = b""
-    to: int = 0  # id of the one agent that takes the frame in; 0: all
+    to: int = 0  # id of the one agent that receives the frame; 0: all
 
 
 class ListeningRadios:
     """Radios that listen before they send: each holds one frame until its policy's ``sensed`` says that it may begin.
 
-    The medium says whether the air is in use where a radio is: range, hidden senders, the turn-round to sending.
-
-    :param air: the air; the caller puts on it what begins.
-    :param rules: the policy of each radio, (N,).
+    The air says whether it is in use where a radio is; the caller puts on it what begins. ``rules``: (N,) policies.
     """
 
     def __init__(self, air: Air[Any], rules: Sequence[Guarded]) -> None:
@@ -86,10 +84,7 @@ class ListeningRadios:
         return events[0][:2] if events else (NEVER, 0)
 
     def listen(self, positions: Positions | None = None) -> tuple[int, int] | None:
-        """Let the next radio listen; return (ns, id) if it begins to send, None if it waits.
-
-        :raises PluginError: if the policy's answer cannot be, or lets the radio listen without end.
-        """
+        """Let the next radio listen; return (ns, id) if it begins to send, None if it waits."""
         now_ns, agent = self.next
         held, rule = self._held[agent], self._rules[agent - 1]
         busy = self._air.busy(agent, now_ns, positions)
@@ -113,12 +108,9 @@ class ListeningRadios:
 
 
 class UnslottedTraffic:
-    """Lets the policies of all agents act, on one medium.
+    """Lets the policies of all agents act, on one medium; each agent has a table of its own.
 
     At one instant arrivals come first, then what agents and radios do, in the order of their ids.
-
-    :param swarm: all agents, with an unslotted policy; each has a table of its own.
-    :param channel: the medium.
     """
 
     def __init__(self, swarm: Swarm, channel: Channel) -> None:
@@ -134,7 +126,7 @@ class UnslottedTraffic:
         heapify(self._wakes)
         self._due_ns = [0] * len(swarm.ids)  # the entry of each agent in that heap that counts
         self._free_ns = [0] * len(swarm.ids)  # when each radio has done with its last packet
-        self._count = 0
+        self._slot = self._count = 0
         self._on_air: dict[int, _Packet] = {}
         self._arriving: list[tuple[int, int, _Packet, NDArray[np.bool_]]] = []  # heap by arrival
         self._frames: list[bytes] = []
@@ -142,11 +134,8 @@ class UnslottedTraffic:
         self._began: set[int] = set()
 
     def slot(self, slot: int) -> SlotTraffic:
-        """Everything that happens on the air in a slot; tables are as they were when it began.
-
-        :param slot: its number; slots come one after the other.
-        """
-        swarm, end_ns = self._swarm, (slot + 1) * self._slot_ns
+        """What happens on the air in the slot after the last one; tables are as they were at its start."""
+        swarm, end_ns, self._slot = self._swarm, (slot + 1) * self._slot_ns, slot
         self._carried, self._began = SlotTraffic(), set()
         swarm.sends[:] = swarm.present > 0
         swarm.emit(slot)
@@ -187,7 +176,7 @@ class UnslottedTraffic:
         """Lets a policy act, unless its agent is switched off."""
         if self._swarm.present[index]:
             policy, table = self._swarm.policies[index], self._swarm.tables[index]
-            answer = policy.wake(table, now_ns, _Radio(self, index, now_ns))
+            answer = policy.wake(table, now_ns, Radio(self, index, now_ns))
             if self._radios is not None and self._radios.holds(self._swarm.ids[index]):
                 return
             end_ns = _next_wake(policy, answer, now_ns)
@@ -206,27 +195,15 @@ class UnslottedTraffic:
             answer = policy.sent(table, now_ns)
             self._call_at(index, _next_wake(policy, answer, now_ns, "sent"))
 
-    def send(self, index: int, now_ns: int, note: bytes = b"", to: int = 0) -> bool:
-        """An agent begins to send its frame of this slot, or its radio listens first; False: it still sends another.
-
-        :param index: its position in ``ids``.
-        :param now_ns: ns, now.
-        :param note: bytes that precede the frame.
-        :param to: id of the one agent that takes it in; 0: all do.
-        """
-        if not self._frames[index]:
-            return False
-        if self._radios is not None:
-            self._radios.hand_over(self._swarm.ids[index], now_ns + self._to_radio_ns(len(self._frames[index])))
-            return True
-        return self.transmit(_Packet(self._swarm.ids[index], self._frames[index], note, to), now_ns)
+    def send(self, index: int, now_ns: int, note: bytes, to: int) -> bool:
+        """An agent begins to send its frame of this slot, or its radio listens first; see :class:`Radio`."""
+        frame = self._frames[index]
+        if frame and self._radios is not None:
+            self._radios.hand_over(index + 1, now_ns + self._to_radio_ns(len(frame)))
+        return bool(frame) and (self._radios is not None or self.transmit(_Packet(index + 1, frame, note, to), now_ns))
 
     def transmit(self, packet: _Packet, now_ns: int) -> bool:
-        """A radio begins to send a packet; False: it still sends another.
-
-        :param packet: the packet.
-        :param now_ns: ns, now.
-        """
+        """A radio begins to send a packet; False: it still sends another."""
         if not isinstance(packet.note, bytes) or packet.to not in range(len(self._frames) + 1):
             policy, given = self._swarm.policies[packet.sender - 1].name, (packet.note, packet.to)
             raise PluginError(f"{policy}, wake", f"sent {given!r}; allowed: bytes, to 0 (all) to {len(self._frames)}")
@@ -236,39 +213,24 @@ class UnslottedTraffic:
         return True
 
     def frame(self, index: int) -> bytes:
-        """An agent's frame of this slot, which its policy sends in packets of its own.
-
-        :param index: its position in ``ids``.
-        """
+        """An agent's frame of this slot, which its policy sends in packets of its own."""
         if self._frames[index]:
             self._began.add(index)
         return self._frames[index]
 
     def receive_frame(self, index: int, frame: bytes, slot: int) -> None:
-        """An agent hears a frame that its policy has put together from packets.
-
-        :param index: its position in ``ids``.
-        :param frame: the frame.
-        :param slot: the slot at whose start its state was.
-        """
+        """An agent hears a frame that its policy has put together from packets."""
         if not isinstance(frame, bytes) or not frame:
             policy = self._swarm.policies[index].name
             raise PluginError(f"{policy}, wake", f"received {frame!r}; allowed: bytes of a frame")
-        mask = np.zeros(len(self._frames), np.bool_)
-        mask[index] = True
-        self._carried.combined.append((slot, frame, mask))
+        self._carried.combined.append((slot, frame, np.arange(len(self._frames)) == index))
 
     def _to_radio_ns(self, length: int) -> int:
         """How long after the order a radio has a packet, ns; a constant delay moves arrivals alone."""
         return self._airtime.to_radio_ns(length) if self._airtime.line.serial else 0
 
     def _begin(self, packet: _Packet, at_ns: int, now_ns: int) -> None:
-        """A radio has a packet, and begins to send it as soon as it can.
-
-        :param packet: the packet.
-        :param at_ns: ns, when it has it.
-        :param now_ns: ns, now.
-        """
+        """A radio has a packet from ``at_ns`` on, and begins to send it as soon as it can."""
         index, length = packet.sender - 1, len(packet.note) + len(packet.frame)
         if not 1 <= length <= self._airtime.longest:
             policy = self._swarm.policies[index].name
@@ -287,21 +249,16 @@ class UnslottedTraffic:
             packet = self._on_air.pop(verdict.frame_id)
             if verdict.received.any():
                 heappush(self._arriving, (verdict.arrival_ns, verdict.frame_id, packet, verdict.received))
-            if verdict.collided or self._carried.outcome == COLLISION:
-                self._carried.outcome = COLLISION
-            else:
-                self._carried.outcome = SUCCESS
+            disturbed = verdict.collided or self._carried.outcome == COLLISION
+            self._carried.outcome = COLLISION if disturbed else SUCCESS
 
     def _deliver(self, until_ns: int) -> None:
         """What has arrived is heard; policies that react do so."""
         while self._arriving and self._arriving[0][0] <= until_ns:
             now_ns, _, packet, received = heappop(self._arriving)
             if packet.frame:
-                mask = received
-                if packet.to:
-                    mask = np.zeros_like(received)
-                    mask[packet.to - 1] = received[packet.to - 1]
-                self._carried.heard.append((packet.frame, mask))
+                mask = received & (np.arange(len(received)) == packet.to - 1) if packet.to else received
+                self._carried.heard.append((self._slot, packet.frame, mask))
             if not self._reacts:
                 continue
             for index in np.flatnonzero(received & (self._swarm.present > 0)).tolist():
@@ -310,8 +267,8 @@ class UnslottedTraffic:
                 self._call_at(index, _next_wake(policy, answer, now_ns, "received"))
 
 
-class _Radio:
-    """What a policy has of the radio while it acts; see :class:`~dtsa_agent.core.plugins.kinds.PacketRadio`."""
+class Radio:
+    """The radio of an agent that is not bound to slots, while its policy acts. It sends one packet at a time."""
 
     __slots__ = ("_index", "_now_ns", "_traffic")
 
@@ -319,31 +276,35 @@ class _Radio:
         self._traffic, self._index, self._now_ns = traffic, index, now_ns
 
     def send(self, note: bytes = b"", to: int = 0) -> bool:
+        """Begin to send the agent's frame, with its state at the start of the slot; False: another one is on the air.
+
+        A radio that senses the carrier keeps the frame, and begins when the policy's ``sensed`` returns 0.
+
+        :param note: header of the policy's own, before the frame.
+        :param to: id of the only agent that receives it, 0: all.
+        """
         return self._traffic.send(self._index, self._now_ns, note, to)
 
     def send_note(self, note: bytes) -> bool:
+        """Begin to send a packet without a frame; False: another one is on the air."""
         return self._traffic.transmit(_Packet(self._index + 1, b"", note), self._now_ns)
 
     def frame(self) -> bytes:
+        """Return the agent's frame for the policy's own packets; it counts as sent. Empty: the agent has none."""
         return self._traffic.frame(self._index)
 
     def receive_frame(self, frame: bytes, slot: int) -> None:
+        """Pass a frame to the agent that its policy has decoded from packets; ``slot``: that of the state in it."""
         self._traffic.receive_frame(self._index, frame, slot)
 
 
 def _next_wake(policy: Guarded, answer: object, now_ns: int, method: str = "wake") -> int:
-    """Return when a policy wants to be called next, ns.
-
-    :raises PluginError: if it is no later time.
-    """
+    """Return when a policy wants to be called next, ns: later than now."""
     return _whole_ns(policy, answer, method, now_ns + 1, f"whole numbers above {now_ns}, the present time")
 
 
 def _whole_ns(policy: Guarded, answer: object, method: str, least: int, allowed: str) -> int:
-    """Return the number of ns that a policy has answered.
-
-    :raises PluginError: if it is none, or smaller than ``least``.
-    """
+    """Return the number of ns that a policy has answered, ``least`` or more."""
     try:
         number = operator.index(answer)  # type: ignore[arg-type]
     except Exception:  # whatever its __index__ raises

@@ -16,8 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.crazyflies.simulated import Fleet, FleetConfig, cli, crtp
-from dtsa_bench.crazyflies.simulated.fleet_config import LAYOUTS, start_positions
+from dtsa_bench.commands.cli import main
+from dtsa_bench.crazyflies.simulated import Fleet, FleetConfig, crtp
+from dtsa_bench.crazyflies.simulated.fleet_config import ellipse_positions
 from dtsa_bench.crazyflies.simulated.process import free_base_port
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
@@ -124,9 +125,8 @@ def test_bad_fleets_are_refused(values: dict[str, Any], field: str) -> None:
     assert error.value.field == field
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_layouts_keep_their_distance(name: str) -> None:
-    p = start_positions(name, 12)
+def test_start_positions_keep_their_distance() -> None:
+    p = ellipse_positions(12)
     assert p.shape == (3, 12)
     assert np.abs(p[0]).max() <= 1.2 + 1e-12
     assert np.abs(p[1]).max() <= 2.0 + 1e-12
@@ -138,10 +138,10 @@ def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     port = free_base_port(1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as busy:
         busy.bind(("127.0.0.1", port))
-        assert cli.main(["--count", "1", "--base-port", str(port)]) == 2
+        assert main(["fake-crazyflie", "--count", "1", "--base-port", str(port)]) == 2
     assert "port: got" in capsys.readouterr().err
-    assert cli.main(["--count", "0"]) == 2
-    assert cli.main(["--fault", "drop", "--base-port", str(port)]) == 2
+    assert main(["fake-crazyflie", "--count", "0"]) == 2
+    assert main(["fake-crazyflie", "--fault", "drop", "--base-port", str(port)]) == 2
     assert "control port of a running fleet" in capsys.readouterr().err
 
 
@@ -158,7 +158,10 @@ def test_a_running_fleet_answers_and_ends_with_ctrl_c(tmp_path: Path) -> None:
         host.connect(("127.0.0.1", port - 1))
         host.send(b"nonsense")
         assert json.loads(host.recv(512))["ok"] is False
-        assert cli.main(["--fault", "freeze", "--cf", "2", "--seconds", "0.2", "--base-port", str(port)]) == 0
+        assert (
+            main(["fake-crazyflie", "--fault", "freeze", "--cf", "2", "--seconds", "0.2", "--base-port", str(port)])
+            == 0
+        )
     (fault,) = fleet.events(name="fault: freeze")
     assert set(fault) == {"t", "cf", "event", "seconds"}
 

@@ -301,7 +301,7 @@ def test_the_ground_gives_orders_at_instants(write) -> None:
 )  # fmt: skip
 def test_an_app_that_fails_is_named(write, code: str, said: str) -> None:
     with pytest.raises(AppError, match=said) as error:
-        fly(write(code), 2.0, ALONE)
+        fly(read_app(write(code)), 2.0, ALONE)
     assert "agent 1" in str(error.value)
 
 
@@ -313,7 +313,7 @@ def test_an_app_that_fails_is_named(write, code: str, said: str) -> None:
 ])  # fmt: skip
 def test_bad_input_is_said_in_a_line(write, code: str, settings: str, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
-        fly(write(code, settings), 1.5)
+        fly(read_app(write(code, settings)), 1.5)
     with pytest.raises(ConfigError, match="beacons, dtr"):
         read_app("nowhere")
 
@@ -361,6 +361,6 @@ void appMain(void) { vTaskDelay(7); top += place; room[place] = (char)top; }""")
         asked = subprocess.run([*compiler(), f"-print-file-name={name}"], capture_output=True, text=True, check=True)
         if asked.stdout.strip() == name:
             pytest.skip(f"no {name}")
-    assert "signed integer overflow" in fly(place, 0.1, ALONE, flags=("-fsanitize=undefined",))["warnings"]
+    assert "signed integer overflow" in fly(read_app(place, flags=("-fsanitize=undefined",)), 0.1, ALONE)["warnings"]
     with pytest.raises(AppError, match="global-buffer-overflow"):
-        fly(place, 0.1, ALONE, flags=("-fsanitize=address",))
+        fly(read_app(place, flags=("-fsanitize=address",)), 0.1, ALONE)

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_bench.crazyflies.peer_lab.app import LabSettings
+from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.peer_lab.process import fly
 from dtsa_bench.runs.config import RunConfig
@@ -29,7 +29,7 @@ def scheme_ms(policy: str, **options: float) -> float:
 
 
 def lab_ms(app: str) -> float:
-    return float(fly(app, 12.0, LabSettings(agents=12, seed=1))["mean_age_ms"])
+    return float(fly(read_app(app), 12.0, LabSettings(agents=12, seed=1))["mean_age_ms"])
 
 
 def test_beacons_have_the_ages_of_the_scheme() -> None:

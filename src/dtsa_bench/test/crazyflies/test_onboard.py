@@ -40,7 +40,7 @@ def test_apps_decide_what_agents_on_computers_decide(swarm: SwarmConfig, lab: La
     with OnboardSwarm(swarm, lab, tmp_path, key=bytes(range(16)) if swarm.auth else b"", enable_s=6.0) as flight:
         assert flight.lab.warnings == ""
         flight.lab.run(11.5)
-        summary = flight.finish()
+        summary = flight.summary()
     found = merged(tmp_path)
     assert is_verified(found)
     assert found["decisions_again"]["differences"] == []
@@ -59,7 +59,7 @@ def test_a_policy_that_nobody_can_join_begins_with_all_together(loss: float, tmp
     flown.mkdir()
     with OnboardSwarm(SwarmConfig(agents=6, policy="dtsa"), LabSettings(loss=loss), flown, enable_s=6.0) as flight:
         flight.lab.run(11.5)
-        summary = flight.finish()
+        summary = flight.summary()
     assert summary["crashed"] == []
     assert main(["merge", *map(str, sorted(flown.glob("cf*.mcap"))), "--out", str(whole)]) == 0
     assert main(["verify", str(whole)]) == 0  # nobody has broken a rule
@@ -77,7 +77,7 @@ def test_the_same_seed_gives_the_same_bits() -> None:
         lab = LabSettings(seed=seed, loss=0.2, drift_ppm=50.0, polls=20.0)
         with OnboardSwarm(SwarmConfig(agents=3, policy="lease"), lab) as flight:
             flight.lab.run(9.0)
-            digests.append(flight.finish()["digest"])
+            digests.append(flight.summary()["digest"])
     assert digests[0] == digests[1] != digests[2]
 
 
@@ -90,7 +90,7 @@ def test_one_is_switched_off_and_on_again_and_the_others_fly_on(tmp_path: Path) 
         lab.run(16.0)
         assert lab.log(4, "dtsa.heard") > 50  # from the floor, it takes part
         assert [lab.log(k, "dtsa.mode") for k in (1, 2, 3, 5)] == [FLY] * 4
-        flight.finish()
+        flight.summary()
     assert merged(tmp_path)["decisions_again"]["differences"] == []
 
 
@@ -106,7 +106,7 @@ def test_an_agent_with_a_new_goal_is_soon_heard(known: bool, tmp_path: Path) -> 
         lab.run(13.3)
         new = [lab.log(k, "dtsa.sent") - old for k, old in enumerate(before, 1)]
         lab.run(13.3 if known else 15.0)
-        flight.finish()
+        flight.summary()
     assert all((data == b"T\0goals known") == known for _, _, data in lab.from_apps[-5:])
     assert known or min(new) >= 3  # of 30 slots each has six
     assert merged(tmp_path)["decisions_again"]["differences"] == []
@@ -150,7 +150,7 @@ def test_who_hears_nobody_hovers_and_then_lands() -> None:
         lab.run(9.6)
         assert lab.from_apps[-1][2] == b"Z\0order"
         for agent in (2, 3):  # their radios only: they hang in the air by the high-level commander
-            flight.mute(agent)
+            lab.set_parameter(agent, "dtsa.mute", 1)
         lab.run(11.0)
         assert (lab.log(1, "dtsa.mode"), lab.log(1, "dtsa.why")) == (HOVER, UNHEARD)
         lab.run(18.0)

@@ -9,10 +9,9 @@ import pytest
 from dtsa_agent.crazyflie import addresses as budget
 from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
-from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, BROADCAST, RATE_NAMES, Agenda, RadioAir
+from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, BROADCAST, RATE_NAMES, RadioAir
 from dtsa_bench.crazyflies.simulated.radio.dongle import DongleModel
 from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, RadioReceiver
-from dtsa_bench.crazyflies.simulated.radio.sniffer_mode import SnifferMode
 
 NULL, SAFELINK = b"\xff", b"\xff\x05\x01"
 PACKET = b"\x3c" + bytes(14)
@@ -30,19 +29,15 @@ class Room:
     stations: tuple[RadioAddress, ...] = (station(1), station(2))
     heard: list[tuple[int, bytes]] = field(default_factory=list)
     deaf: set[tuple[int, bool]] = field(default_factory=set)  # index, up: what a fault stops
-    agenda: Agenda = field(default_factory=Agenda)
 
     def __post_init__(self) -> None:
         first = self.settings.dongles + 1
         self.receivers = [
             RadioReceiver(s, lambda packet, t, k=k: self.heard.append((k, packet))) for k, s in enumerate(self.stations)
         ]
-        by_id = {first + k: receiver for k, receiver in enumerate(self.receivers)}
-        air = RadioAir(first - 1 + len(by_id), self.settings.loss, self.settings.seed)
-        sniffers: dict[int, SnifferMode] = {}
-        self.dongles = [
-            DongleModel(k, self.settings, air, self.agenda, by_id, self._hears, sniffers) for k in range(1, first)
-        ]
+        air = RadioAir(first - 1 + len(self.receivers), self.settings.loss, self.settings.seed)
+        air.receivers, air.passes, self.agenda = dict(enumerate(self.receivers, first)), self._hears, air.agenda
+        self.dongles = [DongleModel(k, self.settings, air) for k in range(1, first)]
 
     def _hears(self, radio: int, up: bool) -> bool:
         return (radio - self.settings.dongles - 1, up) not in self.deaf
@@ -172,7 +167,7 @@ def test_what_the_devices_cannot_do() -> None:
         assert (room.exchange(PACKET)[0][1] != b"\0") is there, (device, rate, channel)
     room = Room(RadioSettings(dongles=2, device="pa"), ())
     room.dongles[0].request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
-    assert room.dongles[0].sniffer.tuned is None
+    assert room.dongles[0].sniffer.tuning is None
 
 
 SHARED = RadioAddress("", 80, "2M", BROADCAST)

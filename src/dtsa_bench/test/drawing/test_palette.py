@@ -84,7 +84,7 @@ def test_an_agent_has_one_colour_in_page_picture_layouts_and_markers() -> None:
     inked = [to_hex(line.get_color()) for line in axes.lines if line.get_linestyle() == "-"]
     assert [colour for colour in inked if colour != "#ffffff"] == wanted
 
-    data = MarkerPacker([str(agent) for agent in range(1, count + 1)]).pack(
+    data = MarkerPacker(range(1, count + 1)).pack(
         0, np.zeros((3, count)), np.ones(count, np.uint8), np.zeros((3, count))
     )
     markers = typestore().deserialize_cdr(data, "visualization_msgs/msg/MarkerArray").markers

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import tracemalloc
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,7 +17,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Frame, Process, Report, Slot
 from rclpy.node import Node
 
-from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
 from dtsa_agent.core.frame import encode_frame
@@ -27,16 +26,15 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.messages import header_of
 from dtsa_bench.flights import measurement
-from dtsa_bench.flights.measurement import PositionLog
+from dtsa_bench.flights.measurement import FlightPath
 from dtsa_bench.flights.recorded_channel import RecordedFlight
-from dtsa_bench.flights.slot_messages import SlotMessages
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
-from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus, ObserverError, Observers, SlotLimit
+from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus, ObserverError, Observers
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 Sender = TypeVar("Sender", bound="LateSender")
@@ -104,7 +102,7 @@ def test_a_channel_needs_no_observer_and_a_slot_is_told_in_order(tmp_path: Path)
         host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=3")
         for observers in ((), (Diary(pages),)):
             node = Node("channel", context=graph.node.context, enable_rosout=False)
-            channel = LockstepChannel(node, Channel(ChannelConfig(agents=3)), 1, referee=SlotLimit(2))
+            channel = LockstepChannel(node, Channel(ChannelConfig(agents=3)), 1, slots=2)
             channel.observe(*observers)
             try:
                 channel.run(stop=False)
@@ -196,7 +194,7 @@ def flown_with(kind: type[Sender], folder: Path, slots: int) -> tuple[RealtimeCh
     """The channel of a flight in real time of two agents for whom an observer answers, and that observer."""
     with ros_graph(folder) as graph:
         node = Node("channel", context=graph.node.context, enable_rosout=False)
-        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, referee=SlotLimit(slots))
+        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, slots=slots)
         observer = kind(graph.node, channel)
         channel.observe(observer)
         try:
@@ -269,55 +267,12 @@ def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_pat
     assert sender.frames == [(2, [True, False], 0)]
 
 
-AGENTS, RUN, SLOT_NS = 9, 77, 10_000_000
-PACKED = SlotMessages(make_scenario(SwarmConfig(agents=AGENTS)), SLOT_NS, RUN)
-
-
-def test_combinations_of_reasons_are_not_kept_for_ever() -> None:
-    packed, answers = SlotMessages(make_scenario(SwarmConfig(agents=AGENTS)), SLOT_NS, RUN), Answers(AGENTS, 1)
-
-    def pack(first: int) -> int:
-        for slot in range(first, first + 700):
-            answers.reason[:] = [(slot >> bit) & 1 for bit in range(AGENTS)][::-1]
-            answers.reason[0] = slot % 7
-            packed.decision(slot, answers)
-        return tracemalloc.get_traced_memory()[0]
-
-    tracemalloc.start()
-    try:
-        before = pack(0)
-        assert pack(700) < before + 50_000
-    finally:
-        tracemalloc.stop()
-
-
-@pytest.mark.parametrize("in_memory", [1 << 20, 0, 1000])
-def test_what_was_put_in_comes_out(in_memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measurement, "_IN_MEMORY", in_memory)
-    random = np.random.default_rng(1)
-    positions = random.normal(size=(50, 3, 7))
-    log = PositionLog(7)
-    assert (bool(log), log.array().shape) == (False, (0, 3, 7))
-    for position in positions:
-        log.append(position)
-    assert len(log) == 50
-    assert np.array_equal(log.array(), positions)
-
-
-def test_a_full_disk_keeps_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measurement, "_IN_MEMORY", 1000)
-    log, random = PositionLog(4), np.random.default_rng(2)
-    positions = random.normal(size=(60, 3, 4))
-    for position in positions[:30]:
-        log.append(position)
-
-    def full(data: bytes) -> int:
-        raise OSError(28, "No space left on device")
-
-    assert log._file is not None
-    monkeypatch.setattr(log._file, "write", full, raising=False)
-    for position in positions[30:]:
-        log.append(position)
-    kept = log.array()
-    assert 20 <= len(kept) == len(log) < 60
-    assert np.array_equal(kept, positions[: len(kept)])
+def test_a_path_that_grows_too_long_keeps_every_second_slot(monkeypatch: pytest.MonkeyPatch) -> None:
+    positions = np.random.default_rng(1).normal(size=(50, 3, 7))
+    for most, step in ((1 << 20, 1), (3 * 7 * 8 * 20, 4)):
+        monkeypatch.setattr(measurement, "_MAX_PATH_BYTES", most)
+        path = FlightPath(7)
+        assert path.array().shape == (0, 3, 7)
+        for position in positions:
+            path.append(position)
+        assert np.array_equal(path.array(), positions[::step])

@@ -115,7 +115,7 @@ def test_a_computer_reads_what_the_app_on_board_says(auth: bool, tmp_path: Path)
     with OnboardSwarm(swarm, LabSettings(), tmp_path, key=bytes.fromhex(KEY) if auth else b"", enable_s=6.0) as flight:
         flight.lab.run(5.0)
         port = flight.lab.parameter(1, "dtsa.port")
-        flight.finish()
+        flight.summary()
     heard = CrazyradioSettings(uri="radio://0/80/2M")
     assert port == heard.p2p_port
     datagrams = StationSettings(swarm, link_of(swarm, heard.properties), authenticator(swarm))

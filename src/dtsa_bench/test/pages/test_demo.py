@@ -18,6 +18,7 @@ from PIL import Image
 from dtsa_agent.core import make_scenario
 from dtsa_bench.commands import demo as command
 from dtsa_bench.drawing.palette import AGENT_COLOURS
+from dtsa_bench.experiments.tables import aligned
 from dtsa_bench.pages.demo.flights import HEAD, KILLED, FinishedFlight, demo_steps, table_rows
 from dtsa_bench.pages.demo.picture import draw_animation, draw_demo, killed_cells, killed_parts, step_text
 from dtsa_bench.simulation.simulate import simulate
@@ -149,7 +150,7 @@ def test_the_whole_demo(tmp_path: Path, flights: dict[str, FinishedFlight]) -> N
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("verified ") == 9
     assert (
-        command.aligned([HEAD, *table_rows(STEPS, flights)]) in done.stdout
+        aligned([HEAD, *table_rows(STEPS, flights)], rule=True) in done.stdout
     )  # the nodes fly what the simulation flies
     assert done.stdout.splitlines()[-1] == str(out / "demo.html")
     assert (out / "demo.png").exists()

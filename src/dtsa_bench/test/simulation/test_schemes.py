@@ -14,8 +14,7 @@ from dtsa_dev.protocol.optimum import optimum
 import dtsa
 from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
 from dtsa_agent.core.errors import PluginError
-from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.core.plugins.kinds import Table
+from dtsa_agent.core.plugins.entry_points import Table, make_swarm
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings import GroundStationSettings, SwarmSettings
 from dtsa_agent.stop import Stop
@@ -253,7 +252,7 @@ def test_beacons_come_at_their_rate_also_behind_lines_and_two_with_one_phase_col
     _, carried, _ = traffic("beacons", 1000, options={"beacons.period_ms": 20.0})
     sent = sum(len(slot.lengths) for slot in carried)
     assert sent == pytest.approx(20 * 1000 * 2 / 20, rel=0.02)
-    heard = [len({frame[1] for frame, _ in slot.heard}) for slot in carried]
+    heard = [len({frame[1] for _, frame, _ in slot.heard}) for slot in carried]
     assert sum(heard[:500]) == pytest.approx(sum(heard[500:]), abs=20)  # the same ones, period after period
     # Two of three begin while the third one's frame is on the line: they wait, and meet on the air.
     flown = []
@@ -274,7 +273,7 @@ def test_the_token_ring_takes_as_long_as_its_packets_and_survives_losses() -> No
     airtime, links_ns = Airtime(), 300_000 + ChannelConfig(agents=20).link_delay_ns
     frame_ns, short_ns = (airtime.total_ns(5 + length) + links_ns for length in (config.frame_length, 0))
     turn_ns = 19 * (frame_ns + short_ns) + 3 * short_ns
-    heard = [(frame[1], mask) for slot in carried for frame, mask in slot.heard]
+    heard = [(frame[1], mask) for slot in carried for _, frame, mask in slot.heard]
     assert len(heard) == pytest.approx(19 * 1000 * config.slot_ns / turn_ns, abs=19)
     assert all(mask.sum() == 1 for _, mask in heard)
     everybody_else = [mask.argmax() for _, mask in heard[:19]]
@@ -282,7 +281,9 @@ def test_the_token_ring_takes_as_long_as_its_packets_and_survives_losses() -> No
     assert not any(slot.outcome == COLLISION for slot in carried)
     air._swarm.present[7] = 0
     after = [air.slot(slot) for slot in range(1000, 1400)]
-    assert {int(mask.argmax()) for slot in after[200:] for _, mask in slot.heard} == {7}  # sent to it again and again
+    assert {int(mask.argmax()) for slot in after[200:] for _, _, mask in slot.heard} == {
+        7
+    }  # sent to it again and again
     assert sum(len(slot.lengths) for slot in after[200:]) == pytest.approx(20, abs=1)  # one agent, every 20 ms
     # Each packet crosses the line to its sender's radio, the air, and the line from the radio of who answers.
     settings = {"agents": 20, "policy": "dtr", "seed": 3, "options": {"dtr.react_ms": 0.0}}
@@ -298,7 +299,7 @@ def test_the_token_ring_takes_as_long_as_its_packets_and_survives_losses() -> No
     assert heard == pytest.approx(19 * 1000 * config.slot_ns / turn_ns, abs=19)
     config = SwarmConfig(agents=4, policy="dtr", seed=5, slot_ms=2)
     air = UnslottedTraffic(make_swarm(config), Channel(ChannelConfig(agents=4, slot_ns=2_000_000, seed=5, loss=0.3)))
-    late = [{int(frame[1]) for frame, _ in air.slot(slot).heard} for slot in range(4000)][3000:]
+    late = [{int(frame[1]) for _, frame, _ in air.slot(slot).heard} for slot in range(4000)][3000:]
     assert set().union(*late) == {1, 2, 3, 4}
     with pytest.raises(ConfigError, match="agents: got 21; allowed: 2 to 20 with policy dtr"):
         make_swarm(SwarmConfig(agents=21, policy="dtr"))

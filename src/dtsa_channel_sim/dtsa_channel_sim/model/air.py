@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -35,6 +35,31 @@ class Media(Protocol):
 
     def advance(self, slot: int) -> None:
         """Note that a slot has been dealt with: later changes of settings begin after it."""
+
+
+class Arrivals:
+    """What is on its way to receivers: a heap by time of arrival, ns; what arrives together keeps its order."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, Any]] = []
+        self._count = 0
+
+    @property
+    def next_ns(self) -> int:
+        """When the next one arrives."""
+        return self._heap[0][0] if self._heap else NEVER
+
+    def add(self, arrival_ns: int, item: Any) -> None:
+        """Let something arrive at a time."""
+        self._count += 1
+        heappush(self._heap, (arrival_ns, self._count, item))
+
+    def pop(self, until_ns: int) -> list[Any]:
+        """Return what has arrived by a time, in order."""
+        arrived = []
+        while self.next_ns <= until_ns:
+            arrived.append(heappop(self._heap)[2])
+        return arrived
 
 
 @dataclass(frozen=True, slots=True)

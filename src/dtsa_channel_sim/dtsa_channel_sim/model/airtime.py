@@ -69,6 +69,16 @@ class Airtime:
         """Return the time that a frame takes from the radio to the flight processor, ns."""
         return self.line.from_fixed_ns + self.line.from_byte_ns * length
 
+    def of_messages(self, longest: int) -> Airtime:
+        """Return the times of messages of up to some bytes, and a header: the radio sends packets, back to back."""
+
+        def on_air_ns(length: int) -> int:
+            packets, rest = divmod(length, self.longest)
+            total_ns = packets * self.total_ns(self.longest) + (self.total_ns(rest) if rest else 0)
+            return total_ns - self.ramp_up_ns
+
+        return replace(self, longest=longest + LONGEST_FRAME, formula=on_air_ns)
+
     def latest_ns(self, length: int) -> int:
         """Return the longest time from the order to send until a receiver's flight processor has a frame, ns."""
         line, from_ns = self.line, self.from_radio_ns(length)

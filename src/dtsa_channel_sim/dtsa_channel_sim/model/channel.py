@@ -33,8 +33,8 @@ class Channel:
     """
 
     __slots__ = (
-        "_airtime", "_alone", "_end", "_first", "_idle", "_last", "_losses", "_medium", "_near",
-        "_plain", "_shared", "_simple", "_source", "_spills", "_timeline", "config",
+        "_airtime", "_alone", "_end", "_first", "_idle", "_last", "_losses", "_medium", "_near", "_shared", "_simple",
+        "_source", "_spills", "_timeline", "config",
     )  # fmt: skip
 
     def __init__(self, config: ChannelConfig) -> None:
@@ -92,13 +92,14 @@ class Channel:
             self._use(slot)
         last, self._last = self._last, slot
         if self._simple and not self._near:
-            if len(senders) == 1:
-                alone = self._alone.get(senders[0])
-                if alone is not None:
-                    return alone if self._plain else self._arbitrate_one(slot, senders[0], alone)
-            elif not len(senders):
+            if len(senders) == 1 and senders[0] in self._alone:
+                alone = self._alone[senders[0]]
+                return alone if self._losses.none else self._arbitrate_one(slot, alone)
+            if not len(senders):
                 return self._idle
-        return self._arbitrate_many(slot, slot > last, self._check_senders(senders), lengths, positions)
+        if slot <= last:
+            self._near = []
+        return self._arbitrate_many(slot, senders, lengths, positions)
 
     def medium(self, slot: int) -> Medium:
         """Return the medium of a slot, with the settings that hold in it."""
@@ -120,64 +121,48 @@ class Channel:
         """Make the settings of a slot the present ones."""
         if slot < 0:
             raise LocalProtocolError(f"slot {slot}: slots count from 0")
-        epoch = self._timeline.at(slot)
-        self._first, self._end = epoch.first, _FOREVER if epoch.end is None else epoch.end
-        self._medium = Medium(epoch.config, self._source)
+        self._first, end, config = self._timeline.at(slot)
+        self._end = _FOREVER if end is None else end
+        self._medium = Medium(config, self._source)
         self._losses = self._medium.losses
         # Frames that start with their slot and do not outlast it, everybody in reach: no look at times and
         # places.
         self._shared = self._medium.everywhere and not self._spills
-        self._simple = self._shared and not epoch.config.jam
-        self._plain = self._simple and self._losses.none
+        self._simple = self._shared and not config.jam
 
-    def _arbitrate_one(self, slot: int, sender: int, alone: Verdict) -> Verdict:
+    def _arbitrate_one(self, slot: int, alone: Verdict) -> Verdict:
         """Return the verdict on the only frame of a slot, everybody in reach."""
-        lost = self._losses.lost(slot, sender)
-        received = ~lost
-        received[0, sender - 1] = False
+        (sender,) = alone.senders
+        received = ~self._losses.lost(slot, sender)
+        received[sender - 1] = False
         missing = len(self._alone) - 1 - int(np.count_nonzero(received))
-        if not missing:
-            return alone
-        return Verdict(SUCCESS, alone.senders, received, (missing,), (0,))
+        return Verdict(SUCCESS, alone.senders, received[None], (missing,), (0,)) if missing else alone
 
     def _arbitrate_many(
-        self, slot: int, follows: bool, senders: tuple[int, ...], lengths: Sequence[int] | None,
-        positions: Positions | None,
-    ) -> Verdict:  # fmt: skip
+        self, slot: int, given: Sequence[int], lengths: Sequence[int] | None, positions: Positions | None
+    ) -> Verdict:
         """Return the verdict on any number of frames, in full generality."""
-        if not follows:
-            self._near = []
-        agents = len(self._alone)
+        agents, start_ns, end_ns = len(self._alone), slot * self.config.slot_ns, (slot + 1) * self.config.slot_ns
+        senders = tuple(map(int, given))
+        for sender in senders:
+            if sender not in self._alone:
+                raise LocalProtocolError(f"sender {sender}: ids run from 1 to {agents}")
+        if len(set(senders)) != len(senders):
+            raise LocalProtocolError(f"senders {senders}: an agent sends once in a slot")
         if self._shared and not self._near and len(senders) > 1:
             others = (agents - 1,) * len(senders)
             return Verdict(COLLISION, senders, np.zeros((len(senders), agents), np.bool_), (0,) * len(senders), others)
-        on_air = [*self._near, *self._transmissions(slot, senders, lengths)]
-        first, end_ns = len(self._near), (slot + 1) * self.config.slot_ns
+        if lengths is None:
+            frames = [OnAir(sender, start_ns, start_ns, end_ns) for sender in senders]
+        elif len(lengths) == len(senders):
+            sizes = zip(senders, map(int, lengths), strict=True)
+            frames = [OnAir.of(self._airtime, sender, start_ns, length) for sender, length in sizes]
+        else:
+            raise LocalProtocolError(f"lengths: {len(lengths)} values for {len(senders)} frames")
+        on_air = [*self._near, *frames]
         self._near = [frame for frame in on_air if frame.end_ns > end_ns]
-        if not senders:
-            return self._idle
         receptions = [
-            self._medium.resolve(slot, on_air[k], on_air[:k] + on_air[k + 1 :], positions)
-            for k in range(first, len(on_air))
+            self._medium.resolve(slot, frame, [other for other in on_air if other is not frame], positions)
+            for frame in frames
         ]
         return Verdict.of(senders, receptions)
-
-    def _transmissions(self, slot: int, senders: tuple[int, ...], lengths: Sequence[int] | None) -> list[OnAir]:
-        """Return the transmissions of a slot: all start with it."""
-        start = slot * self.config.slot_ns
-        if lengths is None:
-            return [OnAir(sender, start, start, start + self.config.slot_ns) for sender in senders]
-        if len(lengths) != len(senders):
-            raise LocalProtocolError(f"lengths: {len(lengths)} values for {len(senders)} frames")
-        return [
-            OnAir.of(self._airtime, sender, start, int(length)) for sender, length in zip(senders, lengths, strict=True)
-        ]
-
-    def _check_senders(self, senders: Sequence[int]) -> tuple[int, ...]:
-        ids = tuple(int(sender) for sender in senders)
-        for sender in ids:
-            if sender not in self._alone:
-                raise LocalProtocolError(f"sender {sender}: ids run from 1 to {self.config.agents}")
-        if len(set(ids)) != len(ids):
-            raise LocalProtocolError(f"senders {ids}: an agent sends once in a slot")
-        return ids

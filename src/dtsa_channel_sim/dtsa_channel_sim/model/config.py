@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, build, check, setting, settings_of
@@ -18,6 +18,7 @@ from .measured import MeasuredLosses, losses_of
 from .schedule import Change, Timeline
 from .topology import Groups, LinkLoss, Matrix, listed, parse_links, parse_matrix, parse_partition
 
+Config = TypeVar("Config", bound="ChannelConfig")
 _SLOT_MS = Setting("slot_ms", "float", None, "length of a slot", unit="ms", minimum=1e-6, maximum=1e6)
 
 
@@ -130,7 +131,7 @@ class ChannelConfig(Settings):
         return airtime_of(self.radio, self.bitrate, self.ramp_up_ns, self.link_delay_ns)
 
     @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> ChannelConfig:
+    def from_dict(cls: type[Config], settings: Mapping[str, Any]) -> Config:
         """Return the settings, validated. ``slot_ms`` may stand for ``slot_ns``.
 
         :raises ConfigError: when a name is unknown or a value is not allowed.

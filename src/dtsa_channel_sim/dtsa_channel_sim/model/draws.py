@@ -12,7 +12,8 @@ Words are even, so a threshold of 2^64 - 1 means "always" and 0 means "never", e
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Sequence
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,44 +34,44 @@ def threshold(probability: float | NDArray[np.float64]) -> NDArray[np.uint64]:
     return np.asarray(np.where(p >= 1.0, np.uint64(2**64 - 1), scaled.astype(np.uint64)), dtype=np.uint64)
 
 
+def thresholds(probability: float | NDArray[np.float64], agents: int) -> list[NDArray[np.uint64]]:
+    """Return the threshold of every link, a row for each of N senders: (N,), or () where all have the same."""
+    limits = threshold(probability)
+    return list(limits) if limits.ndim else [limits] * agents
+
+
+def matrix_of(rows: Sequence[NDArray[np.uint64]], agents: int) -> NDArray[np.uint64]:
+    """Return such rows written out, (rows, N)."""
+    return np.array([np.broadcast_to(row, agents) for row in rows])
+
+
 def generator(seed: int, *key: int) -> np.random.Generator:
     """Return the generator that belongs to a seed and a path of numbers below it."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
 
 
-def sender_factors(seed: int, stream: int, agents: int) -> list[np.uint64]:
-    """Return one odd 64-bit constant per sender, indexed by id (index 0 is not used)."""
-    bits = generator(seed, stream, _FACTORS).bit_generator.random_raw(agents + 1)
-    return [np.uint64(int(word) | 1) for word in bits]
-
-
 class WordBlocks:
-    """Words of one stream by slot.
+    """Words of one stream by slot, for N receivers.
 
     :param seed: seed of the channel.
     :param stream: number of the stream.
     :param agents: number of receivers N, the length of a row.
     """
 
-    __slots__ = ("_first", "_last", "_seed", "_stream", "_words", "agents", "rows")
-
     def __init__(self, seed: int, stream: int, agents: int) -> None:
-        self._seed = seed
-        self._stream = stream
-        self.agents = agents
+        self._seed, self._stream, self.agents = seed, stream, agents
         self.rows = max(16, _BLOCK_WORDS // agents)
-        self._first = self._last = 0
-        self._words: Words = np.zeros((0, agents), dtype=np.uint64)
+
+    @cached_property
+    def factors(self) -> list[np.uint64]:
+        """An odd 64-bit constant per sender, by id: the words of its links are those of the receivers times it; 0: 1"""
+        bits = generator(self._seed, self._stream, _FACTORS).bit_generator.random_raw(self.agents + 1)
+        return [np.uint64(1), *(np.uint64(int(word) | 1) for word in bits[1:])]
 
     def row(self, slot: int) -> Words:
-        """Return the words of one slot, (1, N)."""
-        if not self._first <= slot < self._last:
-            number = slot // self.rows
-            self._words = self.block(number)
-            self._first = number * self.rows
-            self._last = self._first + self.rows
-        start = slot - self._first
-        return self._words[start : start + 1]
+        """Return the words of one slot, (N,)."""
+        words: Words = self.block(slot // self.rows)[slot % self.rows]
+        return words
 
     def span(self, first: int, end: int) -> Words:
         """Return the words of the slots from ``first`` up to, not including, ``end``, (end - first, N)."""

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,6 @@ FORMAT = "dtsa-losses 2"
 NUMBERS = ("enter", "leave", "loss_good", "loss_bad")
 _SLOT_NS = Setting("slot_ns", "int", None, "length of a slot; 0: not known", unit="ns", minimum=0, maximum=10**12)
 _MOST_BYTES = 1 << 28
-
-
-class Fitted(NamedTuple):
-    """The chains of a swarm's links."""
-
-    chains: GilbertElliott
-    loss_good: NDArray[np.float64]  # (N, N), row = sender
-    loss_bad: NDArray[np.float64]  # (N, N)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -86,13 +78,13 @@ class MeasuredLosses:
         if len(self.enter) < agents:
             raise ConfigError("losses", f"{self.name}, of {len(self.enter)} agents", f"one of {agents} agents or more")
 
-    def fitted(self, agents: int) -> Fitted:
-        """Return the chains of the links between the first agents."""
+    def fitted(self, agents: int) -> tuple[GilbertElliott, NDArray[np.float64], NDArray[np.float64]]:
+        """Return the chains of the links between the first agents, and their losses in either state, (N, N)."""
         enter, leave, good, bad = (np.array(getattr(self, key))[:agents, :agents] for key in NUMBERS)
         moves = enter + leave
         leave[moves == 0.0] = 1.0  # a chain that never moves is in its good state
         share = np.divide(enter, moves, out=np.zeros_like(enter), where=moves > 0.0)
-        return Fitted(GilbertElliott(share, enter, leave), good, bad)
+        return GilbertElliott(share, enter, leave), good, bad
 
 
 def losses_of(value: object) -> MeasuredLosses | str:
@@ -104,24 +96,21 @@ def losses_of(value: object) -> MeasuredLosses | str:
         return value
     if isinstance(value, Mapping):
         return MeasuredLosses.from_dict(value)
-    if isinstance(value, str | Path):
-        return _read(Path(value)) if str(value) else ""
-    raise ConfigError("losses", value, "path of a file that `losses` has written")
+    if not isinstance(value, str | Path):
+        raise ConfigError("losses", value, "path of a file that `losses` has written")
+    return _read(Path(value)) if str(value) else ""
 
 
 def _read(path: Path) -> MeasuredLosses:
     import hashlib  # an agent in flight has the settings of channels in memory, and no need of hashes
 
+    if path.is_file() and path.stat().st_size > _MOST_BYTES:
+        raise ConfigError("losses", str(path), f"a file of at most {_MOST_BYTES} bytes")
     try:
-        if path.is_file() and path.stat().st_size > _MOST_BYTES:
-            raise ConfigError("losses", str(path), f"a file of at most {_MOST_BYTES} bytes")
         data = path.read_bytes()
-    except OSError as error:
-        raise ConfigError("losses", str(path), f"a file that can be read ({error.strerror})") from None
-    try:
         content: Any = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise ConfigError("losses", str(path), f"a file that `losses` has written: JSON ({error})") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError("losses", str(path), f"a file of JSON that `losses` has written ({error})") from None
     if not isinstance(content, Mapping):
         raise ConfigError("losses", str(path), "a file that `losses` has written: names with values")
     return MeasuredLosses.from_dict({**content, "name": path.name, "sha256": hashlib.sha256(data).hexdigest()})

@@ -95,7 +95,7 @@ class Medium:
         elif self.losses.none:
             return Reception(clear, 0, collided)
         else:
-            received = clear & ~self.losses.lost(slot, frame.sender)[0]
+            received = clear & ~self.losses.lost(slot, frame.sender)
         return Reception(received, int(np.count_nonzero(clear) - np.count_nonzero(received)), collided)
 
     def reach(self, sender: int, positions: Positions | None = None) -> Mask:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeAlias
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings.declaration import Setting, settings_of
+from dtsa_agent.core.settings.declaration import Setting, plain, settings_of
 
 from .topology import parse_links, parse_partition
 
@@ -28,8 +29,7 @@ class Change:
     until: int | None = None  # first slot without them again; None: they stay
 
     def __post_init__(self) -> None:
-        # In one order, so that equal changes are equal objects.
-        object.__setattr__(self, "values", tuple(sorted(self.values, key=lambda pair: pair[0])))
+        object.__setattr__(self, "values", tuple(sorted(self.values)))  # in one order: equal changes are equal objects
 
     @classmethod
     def from_dict(cls, entry: object, config: Config, name: str) -> Change:
@@ -39,43 +39,37 @@ class Change:
 
         :raises ConfigError: naming the part that is wrong.
         """
+        changeable = {spec.name: spec for spec in settings_of(type(config)) if spec.changeable}
         if isinstance(entry, Change):
             entry = entry.to_dict()
         if not isinstance(entry, Mapping):
-            raise ConfigError(name, entry, "{slot: or at_s:, until:, and what changes: " + _changeable(config) + "}")
+            raise ConfigError(name, entry, f"{{slot: or at_s:, until:, and what changes: {', '.join(changeable)}}}")
         slot = _read_slot(entry, "slot", "at_s", config.slot_ns, name)
         until = _read_slot(entry, "until", "until_s", config.slot_ns, name)
         if slot is None:
             raise ConfigError(f"{name}.slot", None, "a slot (slot: 100) or seconds (at_s: 1.0)")
         if until is not None and until <= slot:
             raise ConfigError(f"{name}.until", until, f"a slot after the entry's start, {slot}")
-        values = {key: value for key, value in entry.items() if key not in _TIMES}
+        values = []
+        for key, value in entry.items():
+            if key == "partition":
+                value = parse_partition(value, config.agents, f"{name}.{key}") or ""
+            elif key == "link_loss":
+                value = parse_links(value, config.agents, f"{name}.{key}")
+            elif key in changeable:
+                value = changeable[key].check(value, f"{name}.{key}")
+            elif key not in _TIMES:
+                raise ConfigError(f"{name}.{key}", value, f"a setting that may change: {', '.join(changeable)}")
+            if key not in _TIMES:
+                values.append((key, value))
         if not values:
-            raise ConfigError(name, dict(entry), "at least one of " + _changeable(config))
-        return cls(slot, tuple(_normal(config, key, value, name) for key, value in values.items()), until)
+            raise ConfigError(name, dict(entry), f"at least one of {', '.join(changeable)}")
+        return cls(slot, tuple(values), until)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry as :meth:`from_dict` reads it."""
         until = {} if self.until is None else {"until": self.until}
-        return {"slot": self.slot, **until, **{name: _plain(value) for name, value in self.values}}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return value.to_dict() if hasattr(value, "to_dict") else value
-
-
-def _normal(config: Config, name: str, value: object, entry: str) -> tuple[str, Any]:
-    """Return one changed setting as the configuration stores it; the combination is checked later."""
-    spec = next((spec for spec in settings_of(type(config)) if spec.name == name and spec.changeable), None)
-    if spec is None:
-        raise ConfigError(f"{entry}.{name}", value, "a setting that may change: " + _changeable(config))
-    if name == "partition":
-        return name, parse_partition(value, config.agents, f"{entry}.{name}") or ""
-    if name == "link_loss":
-        return name, parse_links(value, config.agents, f"{entry}.{name}")
-    return name, spec.check(value, f"{entry}.{name}")
+        return {"slot": self.slot, **until, **{name: plain(value) for name, value in self.values}}
 
 
 def _read_slot(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: int, name: str) -> int | None:
@@ -89,12 +83,7 @@ def _read_slot(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: 
     return None
 
 
-def _changeable(config: Config) -> str:
-    return ", ".join(spec.name for spec in settings_of(type(config)) if spec.changeable)
-
-
-@dataclass(frozen=True, slots=True)
-class Epoch:
+class Epoch(NamedTuple):
     """Slots with the same settings: from ``first`` up to, not including, ``end``; None: it lasts."""
 
     first: int
@@ -113,13 +102,11 @@ class Timeline:
     :raises ConfigError: when some slot would have settings that do not go together.
     """
 
-    __slots__ = ("_base", "_changes", "_configs", "_slots")
+    __slots__ = ("_changes", "_configs")
 
     def __init__(self, config: Config) -> None:
-        self._base = config.changed({})
         self._changes: list[Change] = []  # by slot, ascending
-        self._slots: list[int] = [0]  # slots at which settings change, ascending
-        self._configs: list[Config] = [self._base]
+        self._configs: list[Config] = [config.changed({})]  # before the first of them, and after each
         for change in scheduled_changes(config):
             self.add(change)
 
@@ -129,42 +116,33 @@ class Timeline:
         :raises ConfigError: when it, or a later change on top of it, leads to settings that do not go
             together. Nothing is changed then.
         """
-        at = bisect_right(self._changes, change.slot, key=lambda other: other.slot)
-        changes = [*self._changes[:at], change, *self._changes[at:]]
-        keep = next((i for i, slot in enumerate(self._slots) if slot >= change.slot), len(self._slots))
-        slots, configs = self._slots[:keep] or [0], self._configs[:keep] or [self._base]
+        at = bisect_right(self._changes, change.slot, key=_slot_of)
+        changes, configs = [change, *self._changes[at:]], self._configs[: at + 1]
         for item in changes:
-            if item.slot < change.slot:
-                continue
-            config = configs[-1].changed(dict(item.values))
-            if item.slot == slots[-1]:
-                configs[-1] = config
-            else:
-                slots.append(item.slot)
-                configs.append(config)
-        self._changes, self._slots, self._configs = changes, slots, configs
+            configs.append(configs[-1].changed(dict(item.values)))
+        self._changes[at:], self._configs = changes, configs
 
     def at(self, slot: int) -> Epoch:
         """Return the slots with the same settings to which a slot belongs."""
-        i = bisect_right(self._slots, slot) - 1
-        end = self._slots[i + 1] if i + 1 < len(self._slots) else None
-        return Epoch(self._slots[i], end, self._configs[i])
+        at = bisect_right(self._changes, slot, key=_slot_of)
+        first = self._changes[at - 1].slot if at else 0
+        return Epoch(first, self._changes[at].slot if at < len(self._changes) else None, self._configs[at])
+
+
+_slot_of = attrgetter("slot")
 
 
 def scheduled_changes(config: Config) -> Iterable[Change]:
     """Turn entries of the schedule, which may end, into changes that stay, at most one per slot."""
-    names = {name for entry in config.schedule for name, _ in entry.values}
-    edges = sorted({e.slot for e in config.schedule} | {e.until for e in config.schedule if e.until is not None})
-    before = {name: getattr(config, name) for name in names}
+    names = sorted({name for entry in config.schedule for name, _ in entry.values})
+    edges = sorted({slot for entry in config.schedule for slot in (entry.slot, entry.until)} - {None})
+    before = base = {name: getattr(config, name) for name in names}
     for edge in edges:
-        now = {name: getattr(config, name) for name in names}
-        begun = dict.fromkeys(names, -1)
-        for entry in config.schedule:
+        now = dict(base)
+        for entry in sorted(config.schedule, key=_slot_of):
             if entry.slot <= edge and (entry.until is None or edge < entry.until):
-                for name, value in entry.values:
-                    if entry.slot >= begun[name]:
-                        now[name], begun[name] = value, entry.slot
-        values = tuple((name, now[name]) for name in sorted(names) if now[name] != before[name])
+                now.update(entry.values)
+        values = tuple((name, value) for name, value in now.items() if value != before[name])
         before = now
         if values:
             yield Change(edge, values)

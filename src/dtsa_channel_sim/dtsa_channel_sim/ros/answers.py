@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import isnan
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +93,10 @@ class Answers:
             return False
         lengths = (message.steps, *map(len, _SEQUENCES(message)))
         if lengths != self._lengths.get(count) or len(message.goal) not in (0, 24 * count):
-            _check_sizes(message, {"length": count, **sizes_of(count, self.steps)}, self.steps, "an unusable answer")
+            sizes = {"length": count, **sizes_of(count, self.steps)}
+            if not message.goal:
+                del sizes["goal"]
+            _check_sizes(TRANSMISSION.arrays(message), sizes, self.steps, "an unusable answer")
             self._lengths[count] = lengths
         frames: list[bytes] = []
         if message.data or any(message.length):
@@ -164,35 +167,16 @@ def sizes_of(count: int, steps: int) -> dict[str, int]:
 
 
 def _check_sizes(message: Fields, sizes: Mapping[str, int], steps: int, what: str) -> None:
-    """Check the number of control instants in a slot, and the lengths of sequences: bytes, or arrays."""
+    """Check the number of control instants in a slot, and the lengths of arrays."""
     if message.steps != steps:
         raise _unusable(RANGE, message, f"{message.steps} control instants a slot instead of {steps}", what)
     for name, wanted in sizes.items():
-        values = getattr(message, name)
-        length = len(values)
-        if isinstance(values, bytes):
-            length //= _ITEM_BYTES[name]
-            if name == "goal" and not length:
-                continue
-        if length != wanted:
+        if (length := len(getattr(message, name))) != wanted:
             raise _unusable(SIZES, message, f"{length} numbers in {name} for {len(message.agent)} agents", what)
-
-
-_ITEM_BYTES = {
-    name: np.dtype(kind).itemsize for name, kind in zip(TRANSMISSION.fields, TRANSMISSION.kinds, strict=True)
-}
 
 
 def _unusable(reason: str, message: Fields, detail: str, what: str = "an unusable answer") -> BadMessage:
     return BadMessage(reason, f"{agent_names(message.agent)} sent {what}: {detail}")
-
-
-class DeliveredFrame(NamedTuple):
-    """A frame that was sent to its receivers."""
-
-    data: bytes
-    arrival_ns: int
-    received: NDArray[np.bool_]  # (N,)
 
 
 class Accounts:
@@ -206,7 +190,7 @@ class Accounts:
         self.missed = 0  # entries of reports that came too late to count
         self._open: dict[int, Answers] = {}
         self._closed = -1
-        self._delivered: dict[tuple[int, int], DeliveredFrame] = {}  # by slot and sender
+        self._delivered: dict[tuple[int, int], tuple[bytes, int, NDArray[np.bool_]]] = {}  # by slot and sender
         self._receipts: dict[int, dict[tuple[int, int], FrameReceipt]] = {}  # by slot here; slot and sender
         self._places: dict[bytes, Places] = {}
 
@@ -227,9 +211,9 @@ class Accounts:
         reported = [slot for slot, book in self._open.items() if book.answered[agent - 1]]
         return self._open[max(reported)].position[:, agent - 1] if reported else None
 
-    def deliver(self, slot: int, sender: int, delivered: DeliveredFrame) -> None:
-        """A frame has been sent to its receivers."""
-        self._delivered[slot, sender] = delivered
+    def deliver(self, slot: int, sender: int, data: bytes, arrival_ns: int, received: NDArray[np.bool_]) -> None:
+        """A frame has been sent to its receivers, (N,)."""
+        self._delivered[slot, sender] = data, arrival_ns, received
 
     def add(self, message: Fields, latest: int) -> int:
         """Add a report; return its last slot that is still open, -1: none. No slot after ``latest`` can have begun.
@@ -252,15 +236,15 @@ class Accounts:
                 book.add_report(at, message, row)
                 newest = slot
         for slot, sender, here, at_ns, mask in received_in(message):
-            delivered = self._delivered.get((slot, sender))
-            if delivered is None:  # it was not sent to any receiver
+            if (slot, sender) not in self._delivered:  # it was not sent to any receiver
                 continue
+            data, arrival_ns, received = self._delivered[slot, sender]
             receipts = self._receipts.setdefault(max(here, self._closed + 1), {})
             if (slot, sender) not in receipts:
                 never = np.full(self.agents, -1, dtype=np.int64)
-                receipts[slot, sender] = FrameReceipt(slot, sender, delivered.data, delivered.arrival_ns, never)
+                receipts[slot, sender] = FrameReceipt(slot, sender, data, arrival_ns, never)
             times = receipts[slot, sender].at_ns
-            times[at] = np.where(mask & delivered.received[at], max(0, at_ns), times[at])
+            times[at] = np.where(mask & received[at], max(0, at_ns), times[at])
         return newest
 
     def close(self, slot: int) -> None:

@@ -28,7 +28,6 @@ from dtsa_channel_sim.model.config import CHANGEABLE, AnswerLimits, ChannelConfi
 from dtsa_channel_sim.model.schedule import Change
 
 from .lockstep import LockstepChannel
-from .observer import SlotLimit
 from .realtime_channel import RealtimeChannel
 from .ros_channel import RosChannel
 from .run_topics import Diagnostics, RunLog, RunTopics, Transforms
@@ -77,13 +76,15 @@ class ChannelNodeSettings(AnswerLimits):
 
 def watch(channel: RosChannel, node: Node, settings: Mapping[str, Any], space: str) -> None:
     """Tell the graph how a run is doing: topics in the swarm's namespace, diagnostics, transforms, the log."""
-    lockstep = isinstance(channel, LockstepChannel)
     channel.observe(
-        RunLog(node, channel.run_id, lockstep),
+        RunLog(node, channel.run_id, isinstance(channel, LockstepChannel)),
         RunTopics(node, settings, channel.run_id, channel.slot_ns, space),
         Diagnostics(node, channel.slot_ns),
-        Transforms(node, channel.agents, channel.slot_ns, space),
     )
+    try:
+        channel.observe(Transforms(node, channel.agents, channel.slot_ns, space))
+    except ImportError:
+        node.get_logger().info("no transforms on /tf: tf2_msgs is not installed (apt: ros-jazzy-tf2-msgs)")
 
 
 def _body(stop: Stop, supervised: bool) -> None:
@@ -94,10 +95,10 @@ def _body(stop: Stop, supervised: bool) -> None:
         config = ChannelConfig.from_dict(values)
         first = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
         check_parameters(node)
-        medium, referee = Channel(config), SlotLimit(run.slots)
+        medium = Channel(config)
         kind = LockstepChannel if run.mode == MODES[0] else RealtimeChannel
         channel = kind(
-            node, medium, run.steps, run.answer_s, referee=referee, startup_s=run.startup_s, swarm_namespace=space
+            node, medium, run.steps, run.answer_s, slots=run.slots, startup_s=run.startup_s, swarm_namespace=space
         )
         try:
             watch(channel, node, {"mode": run.mode, "channel": config.to_dict()}, space)

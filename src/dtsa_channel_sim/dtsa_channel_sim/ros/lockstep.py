@@ -112,7 +112,7 @@ class LockstepChannel(RosChannel):
         """Check one message; return whether it is an answer that was missing."""
         try:
             message = self._decoded(data, Transmission, TRANSMISSION.read_fields)
-            self.roster.check_sender(message.agent, time.monotonic(), self.loop.sender)
+            self.roster.check_sender(message.agent, self.loop.sender)
             if message.slot < slot:
                 return False  # an answer that was asked for twice
             if message.slot > slot:

@@ -1,11 +1,12 @@
-"""Observers of the channel, which are called when something happens, and the referee, which ends a run."""
+"""Observers of the channel, which are called when something happens."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common.messages import Fields
@@ -82,65 +83,29 @@ class ChannelObserver:
         """The run is over, whatever the reason; called once. What is open has to be finished here."""
 
 
-class Referee(Protocol):
-    """Decides when a run is over."""
-
-    def over(self, slot: int, answers: Answers) -> bool:
-        """Whether the run ends, asked when all agents have answered a slot and all observers know."""
-
-    @property
-    def reason(self) -> str:
-        """Why the run ends; empty while it goes on."""
-        return ""
-
-
-class SlotLimit(Referee):
-    """Ends a run after a number of slots; 0: never."""
-
-    def __init__(self, slots: int = 0) -> None:
-        self._slots, self._over = slots, False
-
-    def over(self, slot: int, answers: Answers) -> bool:
-        self._over = 0 < self._slots <= slot
-        return self._over
-
-    @property
-    def reason(self) -> str:
-        return f"{self._slots} slots have passed" if self._over else ""
-
-
 class Observers(ChannelObserver):
     """Passes every event on to any number of observers; an error of one that is no DtsaError names it."""
 
     def __init__(self) -> None:
-        self._close_calls: list[Callable[[], None]] = []
+        self._calls: dict[str, list[Callable[..., None]]] = {}  # those that observe an event, by its name
 
     def add(self, observer: ChannelObserver) -> None:
         """Add an observer; it is called after those that are there already."""
         for name, nothing in vars(ChannelObserver).items():
-            if name[0] == "_" or getattr(type(observer), name) is nothing:
-                continue
-            call = _naming(observer, getattr(observer, name))
-            if name == "close":
-                self._close_calls.append(call)
-            else:
-                earlier = vars(self).get(name)
-                setattr(self, name, _in_turn(earlier, call) if earlier else call)
+            if name[0] != "_" and getattr(type(observer), name) is not nothing:
+                calls = self._calls.setdefault(name, [])
+                calls.append(_naming(observer, getattr(observer, name)))
+                if name != "close":
+                    setattr(self, name, calls[0] if len(calls) == 1 else partial(_in_turn, calls))
 
     def close(self) -> None:
-        """Close all observers, also when some of them fail.
+        """Close all observers, once, also when some of them fail.
 
-        :raises DtsaError: the first failure.
+        :raises DtsaError: a failure.
         """
-        if not self._close_calls:
-            return
-        try:
-            self._close_calls.pop(0)()
-        except DtsaError:
-            with suppress(DtsaError):
-                self.close()
-            raise
-        self.close()
+        with ExitStack() as stack:
+            for call in reversed(self._calls.pop("close", [])):
+                stack.callback(call)
 
 
 def _naming(observer: ChannelObserver, event: Callable[..., None]) -> Callable[..., None]:
@@ -155,9 +120,6 @@ def _naming(observer: ChannelObserver, event: Callable[..., None]) -> Callable[.
     return call
 
 
-def _in_turn(first: Callable[..., None], second: Callable[..., None]) -> Callable[..., None]:
-    def call(*arguments: Any) -> None:
-        first(*arguments)
-        second(*arguments)
-
-    return call
+def _in_turn(calls: list[Callable[..., None]], *arguments: Any) -> None:
+    for call in calls:
+        call(*arguments)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from functools import partial
-from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
@@ -22,12 +21,12 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start
 from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.messages import Fields, header_of, ns_of, read_report
-from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
+from dtsa_channel_sim.model.air import NEVER, Air, Arrivals, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .answers import Accounts, Answers, DeliveredFrame
+from .answers import Accounts, Answers
 from .ros_channel import RosChannel
 from .roster import Attendance, RollCall
 
@@ -58,23 +57,19 @@ class Pace:
 
     def __init__(self, slot_ns: int) -> None:
         self._stall_ns = max(_STALL_SLOTS * slot_ns, _STALL_NS)
-        self._last_ns = 0
         self.lag = Delays()  # from when a frame could have been delivered to when it was
         self.stalls: list[tuple[int, int]] = []  # from, to
-        self.stall_count = 0
-        self.last_stall = (0, 0)
+        self.stall_count = self._last_ns = 0
         self._behind_since_ns: int | None = None
 
-    def passed(self, now_ns: int) -> int:
-        """The next pass begins; return for how long the channel stood still before it, ns, 0 if it did not."""
-        gap, before = now_ns - self._last_ns, self._last_ns
-        self._last_ns = now_ns
-        if gap < self._stall_ns:
-            return 0
+    def passed(self, now_ns: int) -> tuple[int, int] | None:
+        """The next pass begins; return from when to when the channel stood still before it, ns; None: it did not."""
+        gap, self._last_ns = (self._last_ns, now_ns), now_ns
+        if now_ns - gap[0] < self._stall_ns:
+            return None
         self.stall_count += 1
-        self.last_stall = before, now_ns
         if len(self.stalls) < _MOST_STALLS:
-            self.stalls.append(self.last_stall)
+            self.stalls.append(gap)
         return gap
 
     def falls_behind(self, now_ns: int, done_ns: int) -> bool:
@@ -92,60 +87,44 @@ class Pace:
         return (self._behind_since_ns or 0) / _NS
 
 
-class LiveAir:
+class LiveAir(Air[SentFrame]):
     """One time line of frames: time is settled a little behind the clock, when all handed over in time is known."""
 
     def __init__(self, channel: Channel) -> None:
+        super().__init__(channel)
         config = channel.config
-        self._air: Air[SentFrame] = Air(channel)
         # A delivery may come no earlier than the frame arrives.
         self.hold_ns = max(round(_GRACE * config.slot_ns), config.airtime.from_radio_ns(0))
-        self._window_ns = round(_WINDOW * config.slot_ns)
+        self._window_ns = max(self.hold_ns, round(_WINDOW * config.slot_ns))
         self.frames: dict[SentFrame, bytes] = {}  # that are or were on the air, until their slot is closed
-        self._arriving: list[tuple[int, int, FrameVerdict[SentFrame]]] = []  # on lines: a heap by arrival
-        self._count = 0
-        self._resolved_ns = -NEVER
-
-    @property
-    def late(self) -> int:
-        """Frames that came when the air had been settled past their start, and were dropped."""
-        return self._air.late
+        self._arriving = Arrivals()  # verdicts on frames that are on lines
 
     @property
     def waits(self) -> bool:
         """Whether a frame waits for its delivery."""
-        return bool(self._air.pending or self._arriving)
+        return self.pending > 0 or self._arriving.next_ns < NEVER
 
     def hand_over(self, key: SentFrame, start_ns: int, data: bytes) -> bool:
-        """Put a frame on the air; return False if it came too late."""
-        if not self._air.begin(key, key[1], start_ns, len(data)):
+        """Put a frame on the air; return False if it is there already, or came too late: no agent hears it."""
+        if key in self.frames or not self.begin(key, key[1], start_ns, len(data)):
             return False
         self.frames[key] = data
         return True
 
     def pop_arrived(self, now: int, positions: Positions) -> list[FrameVerdict[SentFrame]]:
         """Return the verdicts on all frames that have arrived."""
-        ripe, late = now - self.hold_ns, now - max(self.hold_ns, self._window_ns)
-        while (due := self._air.due_ns) <= ripe:
-            self._resolve(due, positions)
-        self._resolve(late, positions)
-        arrived = []
-        while self._arriving and self._arriving[0][0] <= now:
-            arrived.append(heappop(self._arriving)[2])
-        return arrived
+        while (due := self.due_ns) <= now - self.hold_ns:
+            self._resolve_until(due, positions)
+        self._resolve_until(now - self._window_ns, positions)
+        return self._arriving.pop(now)
 
-    def _resolve(self, until_ns: int, positions: Positions) -> None:
-        if until_ns <= self._resolved_ns:
-            return
-        self._resolved_ns = until_ns
-        for verdict in self._air.resolve(until_ns, positions):
-            self._count += 1
-            heappush(self._arriving, (verdict.arrival_ns, self._count, verdict))
+    def _resolve_until(self, until_ns: int, positions: Positions) -> None:
+        for verdict in self.resolve(until_ns, positions):
+            self._arriving.add(verdict.arrival_ns, verdict)
 
     def spare_ns(self, now: int, most_ns: int) -> int:
         """Return for how long there is nothing to do, ns, at most ``most_ns``."""
-        arrival = self._arriving[0][0] if self._arriving else NEVER
-        return min(max(0, min(self._air.due_ns + self.hold_ns, arrival) - now), most_ns)
+        return min(max(0, min(self.due_ns + self.hold_ns, self._arriving.next_ns) - now), most_ns)
 
 
 class RealtimeChannel(RosChannel):
@@ -169,7 +148,7 @@ class RealtimeChannel(RosChannel):
         self.accounts = Accounts(self.agents, steps, max(100, _KEEP_NS // self.slot_ns))
         self.air = LiveAir(channel)
         self.pace = Pace(self.slot_ns)
-        self.round_ms: float | None = None  # of a round of messages before slot 0, median
+        self.round_ms: float | None = None  # of the last round of messages before slot 0
         self._attendance = Attendance(self.agents, self.lost)
         self._steps = steps
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0
@@ -222,9 +201,8 @@ class RealtimeChannel(RosChannel):
         """Wait until all agents have reported, and publish when slot 0 starts; return False when stopped."""
         if not self._call(stop, self.lost):
             return False
-        roll_call = RollCall(
-            self._publisher, self._reports, self.run_id, self._calling, Accounts(self.agents, self._steps, 1)
-        )
+        accounts = Accounts(self.agents, self._steps, 1)
+        roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling, accounts)
         awaited = set(range(1, self.agents + 1))
 
         def still_awaited() -> set[int]:
@@ -236,7 +214,7 @@ class RealtimeChannel(RosChannel):
         if not self._await_all(stop, roll_call.call, still_awaited, _TICK_NS):
             return False
         # An agent that is late with its first report has been nowhere else.
-        answers = roll_call.answers
+        answers = accounts[names.FIRST_CALL]
         answers.carry(self.answers)
         self.answers = answers
         absent = set(self.lost)
@@ -246,7 +224,7 @@ class RealtimeChannel(RosChannel):
             return bool(stop) or self.lost != absent
 
         present = set(range(1, self.agents + 1)) - absent
-        self.round_ms = roll_call.round_ms(present, _TIGHT * self.slot_ns / 1e6, is_disturbed)
+        self.round_ms = roll_call.await_short_round(present, _TIGHT * self.slot_ns / 1e6, is_disturbed)
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS
@@ -276,8 +254,8 @@ class RealtimeChannel(RosChannel):
         more = False
         while not stop:
             data = self.loop.wait(0 if more else self.air.spare_ns(self._now(), _TICK_NS))
-            if self.pace.passed(self._now()):
-                self._resume(self._now())
+            if gap := self.pace.passed(self._now()):
+                self._resume(*gap)
             for _ in range(_FRAMES):
                 if data is None:
                     break
@@ -306,13 +284,12 @@ class RealtimeChannel(RosChannel):
         self._leisure_ns = now
         return True
 
-    def _resume(self, now: int) -> None:
+    def _resume(self, before: int, now: int) -> None:
         """After a stall: what was handed over meanwhile is too late for the air, and silence counts for no agent."""
         self._deliver_arrived(now)
-        before, after = self.pace.last_stall
-        self._recovered_ns = after + (_RECOVERY_NS if after - before > self._patience_ns else self._patience_ns)
-        self._attendance.excuse(after - before, self._recovered_ns)
-        self._observers.stalled(before, after)
+        self._recovered_ns = now + (_RECOVERY_NS if now - before > self._patience_ns else self._patience_ns)
+        self._attendance.excuse(now - before, self._recovered_ns)
+        self._observers.stalled(before, now)
 
     def _falls_behind(self, now: int) -> bool:
         """Whether the run cannot keep up, by its accounts or by the agents' reports."""
@@ -337,7 +314,7 @@ class RealtimeChannel(RosChannel):
         slot, agent, frame = message.slot, message.agent, bytes(message.data)
         if agent in self.lost:
             self._meet_processes()  # a new process tells about itself before it sends anything else
-        self.roster.check_frame(agent, time.monotonic(), self.loop.sender)
+        self.roster.check_frame(agent, self.loop.sender)
         start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
         if not 1 <= len(frame) <= self._longest:
             raise BadMessage(SIZES, f"a frame of {len(frame)} bytes")
@@ -345,8 +322,8 @@ class RealtimeChannel(RosChannel):
             raise BadMessage(RANGE, f"a frame for cf{agent} and slot {slot} that does not name them")
         check_start(start_ns, now, early_ns=_AHEAD * self.slot_ns)
         check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
-        if (slot, agent) in self.air.frames or not self.air.hand_over((slot, agent), start_ns, frame):
-            return  # it is there already, or too late: no agent hears it
+        if not self.air.hand_over((slot, agent), start_ns, frame):
+            return
         if slot > self.slot:
             self.accounts[slot].frames[agent] = frame
         self._observers.frame_sent(slot, agent, frame, start_ns)
@@ -364,7 +341,7 @@ class RealtimeChannel(RosChannel):
             time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
             data = self._pack_slot(time_ns, slot, slot, (sender,), (frame,), verdict.received[None])
             self._publisher.publish(data)
-            self.accounts.deliver(slot, sender, DeliveredFrame(frame, verdict.arrival_ns, verdict.received))
+            self.accounts.deliver(slot, sender, frame, verdict.arrival_ns, verdict.received)
             self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
 
     # The accounts.
@@ -386,7 +363,7 @@ class RealtimeChannel(RosChannel):
         """
         if self.lost and not self.lost.isdisjoint(message.agent[: self.agents]):
             self._meet_processes()
-        self.roster.check_sender(message.agent, time.monotonic(), self._reports.sender)
+        self.roster.check_sender(message.agent, self._reports.sender)
         now = self._now()
         if len(message.slot) and message.slot[0] >= names.FIRST_CALL:
             return  # an answer to a call, which has come late

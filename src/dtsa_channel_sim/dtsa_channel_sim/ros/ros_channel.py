@@ -26,14 +26,13 @@ from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
 
 from .answers import Answers
-from .observer import ChannelObserver, ChannelStatus, Observers, Referee, SlotLimit
+from .observer import ChannelObserver, ChannelStatus, Observers
 from .roster import Roster
 
 REPEAT_S = 0.1
 _CALL_NS = 5_000_000
 _OTHER_CHANNEL_S = 0.3  # a node that calls or opens slots for so long is a channel
 _NAME_S = 1.0  # that the name of its node is waited for
-_UNNAMED = "a node whose name the graph does not know"
 _MOST_PROCESSES = 64  # messages of processes read at a time
 _HURRY_S = 0.2
 
@@ -41,11 +40,13 @@ _HURRY_S = 0.2
 class RosChannel:
     """A medium whose agents are nodes.
 
-    It calls its observers when something happens; a referee says when the run is over.
+    It calls its observers when something happens.
 
     :param waiting: a quarter of the messages of an agent that may wait to be read.
     :param input: type and topic of the messages that the loop waits for.
-    :param referee: ends the run; None: a signal does.
+    :param over: says why the run is over, asked when all agents have answered a slot and all observers know; empty: it
+        goes on.
+    :param slots: the run ends after so many; 0: by ``over`` or a signal.
     :param startup_s: s of wall time that all agents have to answer for the first time.
     :param end_s: s of wall time that the nodes have to hear of the end.
     :param run: the run's id, which all its messages carry; None: a new one.
@@ -56,7 +57,7 @@ class RosChannel:
 
     def __init__(
         self, node: Node, channel: Channel, steps: int, waiting: int, input: tuple[type, str],
-        referee: Referee | None = None, swarm_namespace: str = names.SWARM, startup_s: float = 60.0,
+        over: Callable[[], str] = str, slots: int = 0, swarm_namespace: str = names.SWARM, startup_s: float = 60.0,
         end_s: float = 4.0, run: Run | None = None, agreed: Mapping[str, Any] | None = None,
     ) -> None:  # fmt: skip
         self.node, self.model = node, channel
@@ -67,7 +68,7 @@ class RosChannel:
         self.answers = Answers(self.agents, steps)
         self.lost: set[int] = set()  # ids of agents that have fallen silent
         self._observers = Observers()
-        self._referee = referee or SlotLimit()
+        self._over, self._slots = over, slots
         self.fell_behind = ""  # why the run could not go on; real time only
         self._reason, self._failed = "", False  # why the run has ended, and whether an error ended it
         self._startup_s, self._end_s = startup_s, end_s
@@ -114,8 +115,8 @@ class RosChannel:
                 self._run(stop)
             finally:
                 self._publish_end()
-            cut_short = self.fell_behind or str(getattr(stop, "reason", ""))
-            self._reason = self._referee.reason or cut_short or ("stopped by a signal" if stop else "")
+            self._reason = self._reason or self.fell_behind or str(getattr(stop, "reason", ""))
+            self._reason = self._reason or ("stopped by a signal" if stop else "")
         except DtsaError as error:
             self._reason, self._failed = str(error), True
             raise
@@ -140,8 +141,7 @@ class RosChannel:
             def awaited() -> set[int]:
                 self._read_processes()
                 check_others()
-                done = self.roster.complete(time.monotonic(), absent)
-                return set() if done else set(self.roster.missing) - absent or {0}
+                return self.roster.awaited(time.monotonic(), absent)
 
             self.roster.closed = self._await_all(stop, call, awaited, _CALL_NS)
         return self.roster.closed
@@ -184,11 +184,12 @@ class RosChannel:
                 with self.intake.guard():
                     checks.check_slot(message, self.agents)
                     now = time.monotonic()
-                    waited = now - first_s.setdefault(message.run, now)
-                    others = ", ".join(self._channel_nodes(topic)) if waited > _OTHER_CHANNEL_S else ""
-                    # The graph may know of a publisher before it knows the name of its node.
-                    if others and (_UNNAMED not in others or waited > _OTHER_CHANNEL_S + _NAME_S):
-                        raise ConfigError("run", str(self._identity), f"no other channel on {topic}; there is {others}")
+                    waited_s = now - first_s.setdefault(message.run, now)
+                    if waited_s > _OTHER_CHANNEL_S:
+                        others = self._other_nodes(topic)
+                        if others or waited_s > _OTHER_CHANNEL_S + _NAME_S:
+                            allowed = f"no other channel on {topic}; there is {others or 'a node without a name yet'}"
+                            raise ConfigError("run", str(self._identity), allowed)
 
         try:
             yield check
@@ -196,15 +197,13 @@ class RosChannel:
             feed.close()
             self.node.destroy_subscription(feed.subscription)
 
-    def _channel_nodes(self, topic: str) -> list[str]:
-        """Return the nodes that publish on a topic beside this one."""
-        nodes = [
-            _UNNAMED if "UNKNOWN_" in info.node_name else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            for info in self.node.get_publishers_info_by_topic(topic)
-        ]
+    def _other_nodes(self, topic: str) -> str:
+        """Return the nodes that publish on a topic beside this one; empty: the graph does not know their names yet."""
+        infos = self.node.get_publishers_info_by_topic(topic)
+        nodes = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos]
         if self.node.get_fully_qualified_name() in nodes:
             nodes.remove(self.node.get_fully_qualified_name())
-        return nodes or ["one that has just gone"]
+        return "" if any("UNKNOWN_" in name for name in nodes) else ", ".join(nodes) or "one that has just gone"
 
     def _decoded(self, data: bytes, kind: type, read: Callable[[bytes], Any]) -> Any:
         """Return a message of this run.
@@ -255,7 +254,7 @@ class RosChannel:
     def _meet_processes(self) -> None:
         """Process the messages of processes about themselves, and decide about those that came late."""
         self._read_processes()
-        for process, error in self.roster.refuse_rivals(time.monotonic(), self.lost) if self.roster.closed else ():
+        for process, error in self.roster.decide(time.monotonic(), self.lost) if self.roster.closed else ():
             self._refuse(process, error)
 
     def _housekeeping(self) -> None:
@@ -268,7 +267,8 @@ class RosChannel:
     def _goes_on(self, slot: int, answers: Answers) -> bool:
         """All agents have answered a slot; return whether the run goes on."""
         self._observers.all_answered(slot, answers)
-        return not self._referee.over(slot, answers)
+        self._reason = self._over() or (f"{self._slots} slots have passed" if 0 < self._slots <= slot else "")
+        return not self._reason
 
     def _publish_clock(self, time_ns: int) -> None:
         if self._clock_watched:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import time
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,13 +17,13 @@ from rclpy.publisher import Publisher
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common import checks, names
-from dtsa_agent.ros.common.checks import BadMessage, PublisherGuard
+from dtsa_agent.ros.common.checks import BadMessage
 from dtsa_agent.ros.common.loop import Feed
-from dtsa_agent.ros.common.messages import Fields, read_report
+from dtsa_agent.ros.common.messages import read_report
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_agent.ros.common.runs import run_text
 
-from .answers import Accounts, Answers
+from .answers import Accounts
 
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s
@@ -32,9 +31,8 @@ _LEFT_OVER_S = 3.0  # agents whose channel has gone end within this time
 _MOST_OTHERS = 256  # processes of other runs, or for the same agents
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 _RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
-_ROUNDS, _LONGEST_S = 20, 0.5  # of one measurement
-_SHORTER = 0.8  # rounds that take so much of what those before took become shorter
-_SETTLED_S = 10.0  # after that a measurement counts however long rounds take
+_LONGEST_S = 0.5  # of one round of messages
+_SETTLED_S = 10.0  # after that the run starts, however long rounds take
 _PAUSE_S = 0.0001
 _BURST = 256  # messages; whatever comes, the clock is looked at
 
@@ -48,7 +46,6 @@ class Member:
     ids: tuple[int, ...]
     heard_s: float  # monotonic, when its last message about itself came
     sender: bytes | None  # participant of all its messages; None: not known
-    publisher: PublisherGuard
     dropped: dict[str, int] = field(default_factory=dict)
 
 
@@ -61,8 +58,7 @@ class Roster:
 
     def __init__(self, agents: int, run: int, agreed: Mapping[str, Any], channel: str) -> None:
         self._agents, self._run = agents, run
-        self._agreed = dict(agreed)
-        self._agreed_by = dict.fromkeys(agreed, channel)  # node that has said so, by setting
+        self._agreed = {name: (value, channel) for name, value in agreed.items()}  # and the node that has said so
         self._members: dict[int, Member] = {}  # by process
         self._of: dict[int, Member] = {}  # by agent
         self._groups: dict[bytes, Member] = {}  # by the ids of all agents of a process, as messages carry them
@@ -76,23 +72,26 @@ class Roster:
         """Ids of the agents whose processes are not known yet."""
         return [agent for agent in range(1, self._agents + 1) if agent not in self._of]
 
-    def complete(self, now_s: float, absent: Set[int] = frozenset()) -> bool:
-        """Whether all agents have one process, and nothing is in doubt."""
-        for process, (rival, since_s) in list(self._rivals.items()):
-            if now_s - since_s > _DOUBT_S:  # the older process has not been heard since: it has gone
-                del self._rivals[process]
-                self._replace(rival)
-        return not self._rivals and not set(self.missing) - absent
+    def awaited(self, now_s: float, absent: Set[int] = frozenset()) -> set[int]:
+        """Return the ids of the agents that have no process yet, or that two processes claim."""
+        self.decide(now_s, absent)
+        return {agent for rival, _ in self._rivals.values() for agent in rival.ids} | set(self.missing) - absent
 
-    def refuse_rivals(self, now_s: float, absent: Set[int]) -> list[tuple[int, ConfigError]]:
-        """Decide about processes that came while the run was under way; return those refused, and why."""
+    def decide(self, now_s: float, absent: Set[int]) -> list[tuple[int, ConfigError]]:
+        """Decide about processes that claim agents of others; return those refused, and why.
+
+        Before slot 0 the newer one counts if the older one is not heard any more. Later it is refused, unless its
+        agents are absent.
+        """
         refused = []
         for process, (rival, since_s) in list(self._rivals.items()):
-            taken = {agent for agent in rival.ids if agent in self._of} - absent
-            if taken and now_s - since_s < _LATE_DOUBT_S:
+            taken = {agent for agent in rival.ids if agent in self._of}
+            if self.closed:
+                taken -= absent
+            if taken and now_s - since_s < (_LATE_DOUBT_S if self.closed else _DOUBT_S):
                 continue
             del self._rivals[process]
-            if taken:
+            if taken and self.closed:
                 refused.append((process, self._conflict(rival, taken)))
             else:
                 self._replace(rival)
@@ -123,32 +122,28 @@ class Roster:
 
     def _meet(self, message: Process, now_s: float, sender: bytes | None) -> Member:
         """A process publishes about itself for the first time."""
-        rival = self._rivals.get(message.process)
-        if rival is not None:
-            return rival[0]
-        guard = PublisherGuard(sender)
-        member = Member(message.process, message.node, tuple(message.agent), now_s, sender, guard)
+        if message.process in self._rivals:
+            return self._rivals[message.process][0]
+        member = Member(message.process, message.node, tuple(message.agent), now_s, sender)
         self._compare(message)
-        if any(agent in self._of for agent in member.ids):
-            if len(self._rivals) >= _MOST_OTHERS:
-                raise BadMessage(checks.UNKNOWN, "too many processes for the same agents")
-            self._rivals[member.process] = (member, now_s)
-        else:
+        if self._of.keys().isdisjoint(member.ids):
             self._replace(member)
+        elif len(self._rivals) >= _MOST_OTHERS:
+            raise BadMessage(checks.UNKNOWN, "too many processes for the same agents")
+        else:
+            self._rivals[member.process] = (member, now_s)
         return member
 
     def _replace(self, member: Member) -> None:
         """A process takes the place of those that had its agents."""
-        for agent in member.ids:
-            before = self._of.get(agent)
-            if before is not None and self._members.pop(before.process, None):
+        for before in [self._of[agent] for agent in member.ids if agent in self._of]:
+            if self._members.pop(before.process, None):
                 checks.add_counts(self._gone, before.dropped)
                 del self._groups[_key(before.ids)]
                 for other in before.ids:
                     self._of.pop(other, None)
         self._members[member.process] = self._groups[_key(member.ids)] = member
-        for agent in member.ids:
-            self._of[agent] = member
+        self._of.update(dict.fromkeys(member.ids, member))
 
     def _conflict(self, rival: Member, taken: Set[int]) -> ConfigError:
         nodes = ", ".join(sorted({self._of[agent].node for agent in taken}))
@@ -168,14 +163,11 @@ class Roster:
             given = None
         if not isinstance(given, dict) or settings_hash(given) != message.settings_hash:
             raise BadMessage(checks.RANGE, f"{message.node} says nothing about its settings")
-        for name in sorted(self._agreed):
-            if name not in given or given[name] != self._agreed[name]:
-                allowed = f"{self._agreed[name]!r}, as {self._agreed_by[name]} has it"
-                raise ConfigError(f"{name} of {message.node}", given.get(name), allowed)
-        further = sorted(set(given) - set(self._agreed))
-        if further:  # a channel without agents' settings of its own: those of the first process count
-            self._agreed.update((name, given[name]) for name in further)
-            self._agreed_by.update(dict.fromkeys(further, message.node))
+        for name, (value, node) in sorted(self._agreed.items()):
+            if name not in given or given[name] != value:
+                raise ConfigError(f"{name} of {message.node}", given.get(name), f"{value!r}, as {node} has it")
+        # A channel without agents' settings of its own: those of the first process count.
+        self._agreed = {name: (value, message.node) for name, value in given.items()} | self._agreed
 
     def _note_other_run(self, message: Process, now_s: float) -> None:
         """A process of another run answers our call.
@@ -189,13 +181,13 @@ class Roster:
             allowed = f"no process of another run on these topics; it has {agent_names(message.agent)}"
             raise ConfigError(f"run of {message.node}", run_text(message.run), allowed)
 
-    def check_sender(self, ids: Any, now_s: float, sender: bytes | None) -> None:
+    def check_sender(self, ids: Any, sender: bytes | None) -> None:
         """Check that a message can be from the process that has some agents."""
-        _admit(self._groups.get(ids.tobytes()), lambda: f"a message for {agent_names(ids[:8])}", now_s, sender)
+        _admit(self._groups.get(ids.tobytes()), ids, sender)
 
-    def check_frame(self, agent: int, now_s: float, sender: bytes | None) -> None:
+    def check_frame(self, agent: int, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
-        _admit(self._of.get(agent), lambda: f"a frame of cf{agent}", now_s, sender)
+        _admit(self._of.get(agent), (agent,), sender)
 
     def dropped(self) -> dict[str, int]:
         """Return the number of messages that all processes have dropped, by reason."""
@@ -205,11 +197,12 @@ class Roster:
         return total
 
 
-def _admit(member: Member | None, what: Callable[[], str], now_s: float, sender: bytes | None) -> None:
+def _admit(member: Member | None, ids: Any, sender: bytes | None) -> None:
     if member is None:
-        raise BadMessage(checks.UNKNOWN, f"{what()}, which no process has")
-    if not member.publisher.admits(now_s, sender):
-        raise BadMessage(checks.OTHER_SENDER, f"{what()} that is not of {member.node}")
+        raise BadMessage(checks.UNKNOWN, f"a message for {agent_names(ids[:8])}, which no process has")
+    if sender != member.sender:
+        detail = f"a message for {agent_names(ids[:8])} that is not of {member.node}"
+        raise BadMessage(checks.OTHER_SENDER, detail)
 
 
 def _key(ids: tuple[int, ...]) -> bytes:
@@ -268,7 +261,7 @@ class Attendance:
 
 
 class RollCall:
-    """Calls all agents before slot 0 in real time, by number, and measures how long messages take on this machine.
+    """Calls all agents before slot 0 in real time, by number, until all answer in time.
 
     ``accounts`` get the answers, ``calling`` is the call as slot messages carry it.
     """
@@ -286,58 +279,32 @@ class RollCall:
         self._publisher.publish(Slot(run=self._run_id, phase=Slot.PREPARE, slot=self._number, data=data))
 
     def present(self) -> set[int]:
-        """Return the agents that have answered the first call since this was asked."""
+        """Return the agents that have answered the last call since this was asked."""
         present: set[int] = set()
-        for message in self._answers():
-            with suppress(BadMessage):
-                self._accounts.add(message, self._number)
-                present.update(message.agent)
-        return present
-
-    @property
-    def answers(self) -> Answers:
-        """What all have answered to the first call: where they are, above all."""
-        return self._accounts[names.FIRST_CALL]
-
-    def _answers(self) -> Iterator[Fields]:
-        """Give answers to the last call that have come in, some at a time."""
         for _ in range(_BURST):
             data = self._reports.take()
             if data is None:
-                return
-            try:
+                break
+            with suppress(Exception):  # rclpy has no common base for what a message can do to it
                 message = read_report(data)
-            except Exception:  # rclpy has no common base for what a message can do to it
-                continue
-            if message.run == self._run_id and message.slot.tolist() == [self._number]:
-                yield message
+                if message.run == self._run_id and message.slot.tolist() == [self._number]:
+                    self._accounts.add(message, self._number)
+                    present.update(message.agent)
+        return present
 
-    def round_ms(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
-        """Return how long a round of messages takes, from a call to the last answer: ms, median over some rounds.
+    def await_short_round(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
+        """Call until a round of messages, from a call to the last answer, is short enough, or for some seconds.
 
-        Many processes may have found the channel and still look for each other. So a measurement is repeated for some
-        seconds while only some answer in time, or rounds that take too long become shorter.
+        Many processes may have found the channel and still look for each other. Return how long the last round took.
         """
-        end, before = time.monotonic() + _SETTLED_S, math.inf
+        end_s = time.monotonic() + _SETTLED_S
         while True:
-            took, silent = self._series(agents)
-            settled = silent == agents or (not silent and (took <= enough_ms or took > _SHORTER * before))
-            if settled or time.monotonic() > end or give_up():
-                return took
-            before = math.inf if silent else took
-
-    def _series(self, agents: set[int]) -> tuple[float, set[int]]:
-        """Return the median of some rounds, ms, and the agents that did not answer in time in the last of them."""
-        end, rounds = time.monotonic() + _LONGEST_S, []
-        for _ in range(_ROUNDS):
-            begin, awaited = time.monotonic(), set(agents)
+            begin_s, awaited = time.monotonic(), set(agents)
             self._number += 1
             self.call()
-            while awaited and time.monotonic() < end:
+            while awaited and time.monotonic() < begin_s + _LONGEST_S:
                 time.sleep(_PAUSE_S)
-                for message in self._answers():
-                    awaited.difference_update(message.agent)
-            rounds.append(time.monotonic() - begin)
-            if time.monotonic() >= end:
-                break
-        return float(np.median(rounds)) * 1e3, awaited
+                awaited -= self.present()
+            took_ms = (time.monotonic() - begin_s) * 1e3
+            if took_ms <= enough_ms or time.monotonic() > end_s or give_up():
+                return took_ms

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -40,41 +39,32 @@ def configuration_message(settings: Mapping[str, Any], run_id: int) -> Configura
     )
 
 
-@dataclass(slots=True)
 class RunState:
-    """Content of a status message."""
+    """The status of a run, a dtsa_msgs/RunStatus, by what happens."""
 
-    run_id: int
-    slot_ns: int
-    phase: int = RunStatus.WAITING
-    slot: int = 0
-    awaited: list[int] = field(default_factory=list)
-    reason: str = ""
-    _lost: set[int] = field(default_factory=set)
-    _returned: set[int] = field(default_factory=set)
+    def __init__(self, run_id: int, slot_ns: int) -> None:
+        self.message, self._slot_ns = RunStatus(run=run_id, phase=RunStatus.WAITING), slot_ns
+
+    def reach(self, slot: int, **changed: Any) -> None:
+        """Note that a run has come to a slot, -1: none yet, and fields that have changed."""
+        self.message.slot = max(0, slot)
+        self.message.header = header_of(names.slot_time_ns(self.message.slot, self._slot_ns))
+        for name, value in changed.items():
+            setattr(self.message, name, value)
+        if self.message.phase != RunStatus.WAITING:
+            self.message.awaited = []
 
     def lose(self, agent: int) -> None:
         """Note that an agent has fallen silent."""
-        self._lost.add(agent)
-        self._returned.discard(agent)
+        self._move([agent], "returned", "lost")
 
     def regain(self, agents: list[int]) -> None:
         """Note that agents report again."""
-        self._lost.difference_update(agents)
-        self._returned.update(agents)
+        self._move(agents, "lost", "returned")
 
-    def message(self) -> RunStatus:
-        """Return a dtsa_msgs/RunStatus."""
-        return RunStatus(
-            header=header_of(names.slot_time_ns(self.slot, self.slot_ns)),
-            run=self.run_id,
-            phase=self.phase,
-            slot=self.slot,
-            awaited=self.awaited if self.phase == RunStatus.WAITING else [],
-            lost=sorted(self._lost),
-            returned=sorted(self._returned),
-            reason=self.reason,
-        )
+    def _move(self, agents: list[int], source: str, to: str) -> None:
+        setattr(self.message, source, sorted(set(getattr(self.message, source)) - set(agents)))
+        setattr(self.message, to, sorted({*getattr(self.message, to), *agents}))
 
 
 class RunTopics(ChannelObserver):
@@ -88,16 +78,16 @@ class RunTopics(ChannelObserver):
         self._settings.publish(configuration_message(settings, run_id))
         self._status = node.create_publisher(RunStatus, f"{swarm_namespace}/{names.STATUS}", qos)
         self._state = RunState(run_id, slot_ns)
-        self._next_s = 0.0  # time.monotonic()
+        self._state.reach(0)
         self._publish()
 
     def _publish(self) -> None:
         self._next_s = time.monotonic() + _STATUS_S
-        self._status.publish(self._state.message())
+        self._status.publish(self._state.message)
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         if not slot:
-            self._state.phase = RunStatus.FLYING
+            self._state.reach(0, phase=RunStatus.FLYING)
             self._publish()
 
     def agent_silent(self, agent: int) -> None:
@@ -109,14 +99,13 @@ class RunTopics(ChannelObserver):
         self._publish()
 
     def idle(self, status: ChannelStatus) -> None:
-        state = self._state
-        changed = status.awaited != state.awaited and state.phase == RunStatus.WAITING
-        state.slot, state.awaited = max(0, status.slot), status.awaited
-        if changed or time.monotonic() >= self._next_s:
+        before = list(self._state.message.awaited)
+        self._state.reach(status.slot, awaited=status.awaited)
+        if before != list(self._state.message.awaited) or time.monotonic() >= self._next_s:
             self._publish()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
-        self._state.phase, self._state.slot, self._state.reason = RunStatus.ENDED, max(0, slot), reason
+        self._state.reach(slot, phase=RunStatus.ENDED, reason=reason)
         self._publish()
 
 
@@ -126,12 +115,12 @@ class Diagnostics(ChannelObserver):
     def __init__(self, node: Node, slot_ns: int) -> None:
         self._slot_ns = slot_ns
         self._name = f"{node.get_namespace().strip('/')}: channel"
-        self._counts = [0, 0, 0]  # slots by outcome
+        self._counts = dict.fromkeys(OUTCOMES, 0)  # slots by outcome
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._ticks = 0
 
     def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        self._counts[verdict.outcome] += 1
+        self._counts[OUTCOMES[verdict.outcome]] += 1
 
     def idle(self, status: ChannelStatus) -> None:
         self._ticks += 1
@@ -142,7 +131,7 @@ class Diagnostics(ChannelObserver):
             "not taken in": sum(status.dropped.values()),
             "agents awaited": status.awaited,
             **{f"not taken in: {reason}": count for reason, count in sorted(status.dropped.items())},
-            **{f"slots: {name}": count for name, count in zip(OUTCOMES, self._counts, strict=True)},
+            **{f"slots: {name}": count for name, count in self._counts.items()},
         }
         message = DiagnosticStatus(
             level=DiagnosticStatus.WARN if status.dropped else DiagnosticStatus.OK,
@@ -158,23 +147,18 @@ class Diagnostics(ChannelObserver):
 class Transforms(ChannelObserver):
     """Publishes ``map`` -> ``cfN/base_link`` of all agents on ``/tf`` in one message, while somebody subscribes.
 
-    Needs tf2_msgs, which an installation from apt has and the wheels lack; without it, it says so once and does
-    nothing. The attitude is not modelled: it is the identity.
+    Needs tf2_msgs, which an installation from apt has and the wheels lack. The attitude is not modelled: it is the
+    identity.
     """
 
-    def __init__(self, node: Node, agents: int, slot_ns: int, swarm_namespace: str = names.SWARM) -> None:
-        self._slot_ns = slot_ns
+    def __init__(self, node: Node, agents: int, slot_ns: int, swarm_namespace: str) -> None:
+        from tf2_msgs.msg import TFMessage
+
+        self._slot_ns, self._kind = slot_ns, TFMessage
         spaces = [names.agent_namespace(agent, swarm_namespace) for agent in range(1, agents + 1)]
-        self._bodies = [names.body_frame(space) for space in spaces]
+        self._transforms = [TransformStamped(child_frame_id=names.body_frame(space)) for space in spaces]
         self._next_s = 0.0  # time.monotonic()
         self._watched = False
-        self._publisher: Any = None
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ImportError:
-            node.get_logger().info("no transforms on /tf: tf2_msgs is not installed (apt: ros-jazzy-tf2-msgs)")
-            return
-        self._kind = TFMessage
         self._publisher = node.create_publisher(TFMessage, "/tf", _TRANSFORMS_DEPTH)
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
@@ -182,16 +166,13 @@ class Transforms(ChannelObserver):
             return
         self._next_s = time.monotonic() + _TRANSFORMS_S
         header = header_of(names.slot_time_ns(slot, self._slot_ns))
-        transforms = []
-        for body, (x, y, z) in zip(self._bodies, answers.position.T.tolist(), strict=True):
-            transform = TransformStamped(header=header, child_frame_id=body)
-            place = transform.transform.translation
-            place.x, place.y, place.z = x, y, z
-            transforms.append(transform)
-        self._publisher.publish(self._kind(transforms=transforms))
+        for transform, place in zip(self._transforms, answers.position.T.tolist(), strict=True):
+            transform.header, translation = header, transform.transform.translation
+            translation.x, translation.y, translation.z = place
+        self._publisher.publish(self._kind(transforms=self._transforms))
 
     def idle(self, status: ChannelStatus) -> None:
-        self._watched = self._publisher is not None and self._publisher.get_subscription_count() > 0
+        self._watched = self._publisher.get_subscription_count() > 0
 
 
 class RunLog(ChannelObserver):
@@ -202,8 +183,7 @@ class RunLog(ChannelObserver):
         self._lockstep = lockstep
         self._waiting = WaitingLog(self._logger)
         self._flying = False
-        self._slot, self._since_s = -1, time.monotonic()
-        self._warned = False  # that the slot is slow
+        self._slot, self._since_s = -1, time.monotonic()  # the slot that is watched; infinite: a warning was logged
         self._logger.info(f"run {run_id:08x}: waiting for the agents")
 
     def all_answered(self, slot: int, answers: Answers) -> None:
@@ -215,16 +195,10 @@ class RunLog(ChannelObserver):
         if not self._flying:
             if status.awaited:
                 self._waiting.log(f"waiting for {agent_names(status.awaited)} to answer")
-        elif self._lockstep:
-            self._watch(status)
-
-    def _watch(self, status: ChannelStatus) -> None:
-        """Warn once about a slot that an agent keeps waiting."""
-        now = time.monotonic()
-        if status.slot != self._slot or not status.awaited:
-            self._slot, self._since_s, self._warned = status.slot, now, False
-        elif not self._warned and now - self._since_s > _SLOW_S:
-            self._warned = True
+        elif status.slot != self._slot or not status.awaited:
+            self._slot, self._since_s = status.slot, time.monotonic()
+        elif self._lockstep and time.monotonic() - self._since_s > _SLOW_S:
+            self._since_s = float("inf")
             self._logger.warning(f"slot {status.slot}: still waiting for {agent_names(status.awaited)}")
 
     def agent_silent(self, agent: int) -> None:

@@ -7,15 +7,17 @@ A package declares them in its metadata::
 
 and then ``policy="reverse"`` works everywhere: in `simulate`, `sweep` and in the nodes. The entry point is a factory,
 called once for every observer as ``factory(config, agent)`` (agent: its id, 0 for tables that hear everything). It
-returns an object with one of the interfaces of :mod:`.kinds`.
+returns an object with the methods that docs/reference/plug-ins.md lists.
 """
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS, Registry
@@ -25,11 +27,8 @@ from dtsa_agent.core.settings.scenario import Scenario
 from dtsa_agent.core.swarm import Bytes, SlotOutcome, Swarm
 
 from .guard import Guarded
-from .kinds import Table
 
 _PLUGIN_REASON = REASONS.index("plugin")
-
-
 _REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
 
 
@@ -50,12 +49,9 @@ def can_share_table(config: SwarmConfig) -> bool:
 
 
 def make_swarm(
-    config: SwarmConfig,
-    scenario: Scenario | None = None,
-    local: Sequence[int] | None = None,
-    shared_table: bool = False,
-    observers: Sequence[int] | None = None,
-) -> Swarm:
+    config: SwarmConfig, scenario: Scenario | None = None, local: Sequence[int] | None = None,
+    shared_table: bool = False, observers: Sequence[int] | None = None,
+) -> Swarm:  # fmt: skip
     """Create a :class:`Swarm`, or a :class:`PluginSwarm` if the configuration names plug-ins.
 
     Parameters are those of ``Swarm``; with plug-ins every agent has its own table.
@@ -65,6 +61,45 @@ def make_swarm(
     if not uses_plugins(config):
         return Swarm(config, scenario, local, shared_table, observers)
     return PluginSwarm(config, scenario, local, False, observers)
+
+
+class Table:
+    """Table of one observer; arrays are read-only views, always up to date.
+
+    Positions are m, velocities m/s, frame map, with shape (3, N); agent ``id`` is column ``id - 1``.
+    """
+
+    def __init__(self, swarm: Swarm, row: int) -> None:
+        self._swarm, self._row = weakref.proxy(swarm), row  # a swarm has its tables: no cycle
+        self.agent = int(swarm.observer[row]) + 1  # id of the observer, 0: one that hears everything
+        self.config = swarm.config
+        self.scenario = swarm.scenario
+        self.sent_position = _window(swarm.sent_position[row])  # last heard (own: last sent) state
+        self.sent_velocity = _window(swarm.sent_velocity[row])
+        self.sent_intent = _window(swarm.sent_intent[row])  # commanded velocity, zero unless frames carry it
+        self.sent_slot = _window(swarm.sent_slot[row])  # (N,) slot of that state, -1: never heard
+        self.last_turn = _window(swarm.last_turn[row])  # (N,) slot of the last turn; h = slot - 1 - last_turn
+        self.in_ap = _window(swarm.in_ap[row])  # (N,) A_p
+        self.estimate_position = _window(swarm.estimate_position[row])  # as the estimator last filled them
+        self.estimate_velocity = _window(swarm.estimate_velocity[row])
+        is_local = row < len(swarm.ids)
+        self.own_position = _window(swarm.position[:, row]) if is_local else None  # (3,) own true state
+        self.own_velocity = _window(swarm.velocity[:, row]) if is_local else None
+        self.goal = _window(swarm.goal[:, row]) if is_local else None
+
+    def observation(self, slot: int) -> NDArray[np.float32]:
+        """What the agent has heard before a slot and its own state, as numbers for learning (docs/how-to/learning.md).
+
+        :raises ValueError: for the table of an agent that is elsewhere.
+        """
+        observed: NDArray[np.float32] = self._swarm.observations(slot, self._row, self._row + 1)[0]
+        return observed
+
+
+def _window(array: NDArray[Any]) -> NDArray[Any]:
+    window: NDArray[Any] = array.view()
+    window.flags.writeable = False
+    return window
 
 
 class PluginSwarm(Swarm):
@@ -143,9 +178,9 @@ class PluginSwarm(Swarm):
             if size:
                 yield part.check_own_data(part.own_data(self.tables[index], slot), size)
 
-    def frame(self, local_index: int) -> bytes:
-        data = self._encoded(local_index)
-        return self._sealed(data + self._appended[local_index] if data and self._own_bytes else data)
+    def _encoded(self, local_index: int) -> bytes:
+        data = super()._encoded(local_index)
+        return data + self._appended[local_index] if data and self._own_bytes else data
 
     def _receive(self, slot: int, frame: bytes, mask: Bytes | None) -> bool:
         end = max(0, len(frame) - self._own_bytes)
@@ -221,8 +256,5 @@ class PluginSwarm(Swarm):
             self.move(step)
 
     def with_own_tables(self, slot: int) -> Swarm:
-        """Not supported.
-
-        :raises ValueError: always: agents have tables of their own already.
-        """
+        """Not supported: agents have tables of their own already."""
         raise ValueError("with_own_tables: agents with plug-ins have tables of their own already")

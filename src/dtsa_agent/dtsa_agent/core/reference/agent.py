@@ -7,18 +7,26 @@ before slot i, then flight, then :func:`hear` once a frame, then :meth:`Agent.en
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from dtsa_agent.core.frame import ExtendedFrame, Frame
-from dtsa_agent.core.reference.lease.decide import decide as decide_lease
-from dtsa_agent.core.reference.lease.issue import TurnAnnouncement, announce_turns
-from dtsa_agent.core.reference.lease.listen import end_slot, listen
+from dtsa_agent.core.reference.lease import events
+from dtsa_agent.core.reference.lease.issue import announce_turns
 from dtsa_agent.core.reference.lease.memory import Memory
 
 from . import gossip, policies
 from .arithmetic import ZERO, Vector, minus, norm
-from .frame import PROFILE_EXTENDED, WRONG_HEADER, Refused, decode, encode
-from .frame_extended import SECTION_BYTES, SECTIONS, decode_extended, encode_extended
+from .frame import (
+    PROFILE_EXTENDED,
+    SECTION_BYTES,
+    SECTIONS,
+    WRONG_HEADER,
+    Refused,
+    decode,
+    decode_extended,
+    encode,
+    encode_extended,
+)  # fmt: skip
 from .policies import NOBODY, Choice, Weights
 from .table import EXTENDED, LEAVES, OFF, ON, PAPER, Rules, Table
 
@@ -42,12 +50,12 @@ class Agent:
     memory: Memory = field(init=False)
 
     def __post_init__(self) -> None:
-        self.memory = Memory(self.rules)
+        self.memory = Memory(self.rules, self.index)
 
     def restart(self) -> None:
         """Its program starts anew, knowing nothing but its settings; where it is and flies stays."""
         self.table.reset()
-        self.memory = Memory(self.rules)
+        self.memory = Memory(self.rules, self.index)
 
     def far_from_goal(self) -> bool:
         """Whether it has something to say: p_e > r_min (eq:remaining_t_slots)."""
@@ -66,7 +74,7 @@ class Agent:
                 if self.memory.started:
                     self.restart()  # whatever it knew is gone when it comes back
                 return NOBODY
-            return decide_lease(self.memory, self.index, slot, self.far_from_goal())
+            return events.decide(self.memory, slot, self.far_from_goal())
         if self.rules.policy == "aloha":
             return policies.choose_aloha(self.table, slot, self.index + 1, self.rules)
         return policies.choose(self.table, slot, self.rules, self.weights)
@@ -79,16 +87,13 @@ class Agent:
         own = Frame(self.index + 1, rules.slot_on_air(slot), c_r, self.position, self.velocity, intent)
         if rules.profile != EXTENDED:
             return encode(own, rules.position_step)
-        announcement = TurnAnnouncement()
+        frame = ExtendedFrame(own)
         if rules.policy == "lease":
             leaves = self.present == LEAVES
-            announcement = announce_turns(self.memory, self.index, self.table, slot, self.velocity, self.final, leaves)
-        used = -(-len(announcement.leases) // SECTION_BYTES) + bool(announcement.relay) + bool(announcement.far)
-        carried = gossip.collect(self.table, self.index, slot, SECTIONS - used, rules) if rules.gossip else ()
-        frame = ExtendedFrame(
-            own, announcement.c_s, announcement.leaving, self.memory.probation, carried,
-            announcement.leases, announcement.relay, announcement.far, announcement.far_lessee,
-        )  # fmt: skip
+            frame = announce_turns(self.memory, self.table, own, slot, self.velocity, self.final, leaves)
+        if rules.gossip:
+            room = SECTIONS - (-(-len(frame.leases) // SECTION_BYTES) + bool(frame.relay) + bool(frame.far))
+            frame = replace(frame, gossip=gossip.collect(self.table, slot, room, rules))
         return encode_extended(frame, rules.position_step)
 
     def end(self, slot: int) -> None:
@@ -97,7 +102,7 @@ class Agent:
             if self.choice.index >= 0:
                 self.table.note_turn(self.choice.index, slot)
         elif self.present != OFF and self.memory.started:
-            end_slot(self.memory, self.index, slot, self.sends, self.choice.reason)
+            events.end_slot(self.memory, slot, self.sends, self.choice.reason)
             if self.memory.leaving:
                 self.present = OFF
 
@@ -110,51 +115,41 @@ class Agent:
             self.table.learn(decode(sent, self.rules.position_step), slot)
 
 
-@dataclass(slots=True)
-class Receiver:
-    """A table that takes frames in, and its agent (None: the table of a mere observer, or a shared one)."""
-
-    table: Table
-    agent: Agent | None = None
-
-
 class Foreign(Exception):
     """A frame of an unknown agent or of another time."""
 
 
-def parse(data: bytes, slot: int, rules: Rules) -> tuple[Frame | ExtendedFrame, int]:
+def parse(data: bytes, slot: int, rules: Rules) -> tuple[ExtendedFrame, int]:
     """What the air carried, and the slot in which it was sent: the present one, or the one before.
 
     :raises RemoteProtocolError: if they are no frame of the swarm's kind.
     :raises Foreign: for a frame of an unknown agent or of another time.
     """
-    frame: Frame | ExtendedFrame
     if rules.profile == EXTENDED:
         frame = decode_extended(data, rules.position_step)
-        own = frame.own
     else:
-        frame = own = decode(data, rules.position_step)
+        frame = ExtendedFrame(decode(data, rules.position_step))
         if data[0] & 0xF == PROFILE_EXTENDED:
             raise Refused(WRONG_HEADER, data)
-    late = own.slot != rules.slot_on_air(slot)
-    sampled = slot - late
+    own = frame.own
+    sampled = slot - (own.slot != rules.slot_on_air(slot))
     if sampled < 0 or own.slot != rules.slot_on_air(sampled) or own.sender > rules.agents:
         raise Foreign
-    if isinstance(frame, ExtendedFrame) and not gossip.fits_swarm(frame, sampled, rules):
+    if rules.profile == EXTENDED and not gossip.fits_swarm(frame, sampled, rules):
         raise Foreign
     return frame, sampled
 
 
-def hear(receivers: Sequence[Receiver], frame: Frame | ExtendedFrame, sampled: int, rules: Rules) -> None:
-    """Some observers take in a frame."""
-    for receiver in receivers:
-        own = frame.own if isinstance(frame, ExtendedFrame) else frame
-        row = receiver.table.rows[own.sender - 1]
+def hear(agents: Sequence[Agent], frame: ExtendedFrame, sampled: int, rules: Rules) -> None:
+    """Some agents receive a frame."""
+    own = frame.own
+    for agent in agents:
+        table, row = agent.table, agent.table.rows[own.sender - 1]
         wakes = not row.in_ap and own.c_r != 0
         if row.sent_slot < sampled:
-            receiver.table.learn(own, sampled)
-        if isinstance(frame, ExtendedFrame) and receiver.table.observer != own.sender:
+            table.learn(own, sampled)
+        if table.observer != own.sender:
             for entry in frame.gossip:
-                gossip.learn(receiver.table, sampled - entry.age, entry, rules)
-            if rules.policy == "lease" and receiver.agent is not None:
-                listen(receiver.agent.memory, receiver.agent.index, receiver.table, sampled, frame, wakes)
+                gossip.learn(table, sampled - entry.age, entry, rules)
+            if rules.policy == "lease":
+                events.listen(agent.memory, table, sampled, frame, wakes)

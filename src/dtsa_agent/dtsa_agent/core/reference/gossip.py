@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dtsa_agent.core.frame import ExtendedFrame, Frame, Gossip
 
-from .frame_extended import GOSSIP_AGE_MAX, OPEN, SECTIONS, gossip_fits
+from .frame import GOSSIP_AGE_MAX, OPEN, SECTIONS, gossip_fits
 from .table import Rules, Table
 
 
-def collect(table: Table, self_index: int, slot: int, room: int, rules: Rules) -> tuple[Gossip, ...]:
+def collect(table: Table, slot: int, room: int, rules: Rules) -> tuple[Gossip, ...]:
     """The states that a frame carries: the newest, the newest of k slots or more, and of 2 k or more; k = 2 + N div 16.
 
     The first mends single losses at once; the others reach receivers that heard nothing for a while. What is left of
@@ -18,19 +18,19 @@ def collect(table: Table, self_index: int, slot: int, room: int, rules: Rules) -
     chosen: list[int] = []
     for age in (1, later, 2 * later, *[1] * SECTIONS):
         if len(chosen) < room:
-            chosen += newest_of_age(table, self_index, slot, age, chosen, rules)
+            chosen += newest_of_age(table, slot, age, chosen, rules)
     rows = table.rows
     return tuple(
         Gossip(k + 1, slot - rows[k].sent_slot, rows[k].in_ap, rows[k].position, rows[k].velocity) for k in chosen
     )
 
 
-def newest_of_age(table: Table, self_index: int, slot: int, age: int, chosen: list[int], rules: Rules) -> list[int]:
+def newest_of_age(table: Table, slot: int, age: int, chosen: list[int], rules: Rules) -> list[int]:
     """The newest state of somebody not yet chosen that is ``age`` slots old or older and can be said; or nobody's."""
     fit = [
         k
         for k, row in enumerate(table.rows)
-        if k != self_index
+        if k != table.observer - 1
         and row.sent_slot >= 0
         and age <= slot - row.sent_slot <= GOSSIP_AGE_MAX
         and k not in chosen

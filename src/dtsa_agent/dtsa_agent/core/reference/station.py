@@ -8,78 +8,41 @@ by, a quorum of the others. All times are ns of the own clock; the same in C: ``
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from .agent import Agent, Foreign, Receiver, hear, parse
+from .agent import Agent, Foreign, hear, parse
 from .arithmetic import mix64
-from .frame import Refused, decode
-from .table import EXTENDED, LEAVES, OFF, Rules
+from .datagram import (
+    ACCEPTED,
+    KEEPS_STARTS,
+    OTHER_TIME,
+    REPEATED,
+    SAME_ID,
+    SHARE,
+    Parsed,
+    Settings,
+    names_hear,
+    parse_datagram,
+    write_datagram,
+)  # fmt: skip
+from .frame import LEAVING, PROFILE_EXTENDED, Refused
+from .table import LEAVES, OFF, Rules
 
-Datagram = bytes
 Ns = int  # ns, own clock
 
-ACCEPTED, NOT_OURS, WRONG_LENGTH, OTHER_SETTINGS, NO_FRAME, UNKNOWN_AGENT = range(6)
-REJECTED, REPEATED, OTHER_TIME, SAME_ID, TOO_EARLY = range(6, 11)  # what became of a datagram
 LISTENING, ALONE, JOINED = range(3)
 FLIES, HOVERS_LISTENING, HOVERS_NEW, HOVERS_SAME_ID, HOVERS_QUORUM = range(5)
 IN_STEP, SHIFTED, RESTARTED, OTHER = range(4)  # what a frame says of the time
 
-TAG_LENGTH = 4
-LATE_UNIT_NS = 10_000
 HALF_SECOND_NS = 500_000_000
 RECEPTIONS = 9  # offsets of frames that one alignment takes the median of
 SENT_HISTORY_LENGTH = 16
-LEAVING, PROBATION, MOVES = 255, 2, 1  # of an extended frame, bytes 2 and 3
+MOVES, PROBATION = 1, 2  # of an extended frame, byte 3
 CYCLES = 8  # of lists of one name each, after which an agent that was not named is not heard
-ALL_BUT_ONE, SHARE = -1, -2
-KEEPS_NOTHING, KEEPS_NUMBERS, KEEPS_STARTS = range(3)  # slots move as the rules say; a little; never
-
-
-class Link(NamedTuple):
-    """What carries the datagrams; the same for all stations of a swarm."""
-
-    header: bytes
-    says_late: bool
-    names: int  # heard agents that a datagram names
-    flight_ns: int
-    trust_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Of one station, beside the rules."""
-
-    id: int
-    slot_ns: int
-    seed: int
-    link: Link
-    quorum: int = ALL_BUT_ONE
-    quorum_share: float = 0.0
-    key: bytes = b""
-    session: int = 0
-    early_count: int = 64
-    begins_ns: int | None = None  # start of slot 0, where all begin together
-    late_ns: int | None = None  # start of slot 0, where it listens first and hears no frame
-    keeps_time: int = KEEPS_NOTHING  # whatever it hears, its slots keep their numbers
-    equal_tables: bool = (
-        False  # the policy needs equal tables: it waits longer for frames, and never restarts by itself
-    )
-
-
-class Parsed(NamedTuple):
-    """What a datagram says."""
-
-    sender: int
-    slot: int  # as on the air
-    late_ns: int
-    names: tuple[tuple[int, int], ...]  # id, and how much later than expected its sender hears it, ns
-    frame: bytes
 
 
 @dataclass(slots=True)
@@ -101,8 +64,7 @@ class Peer:
     left: bool = False
 
 
-@dataclass(slots=True)
-class Counts:
+class Counts(NamedTuple):
     """How the others stand with an agent."""
 
     others: int = 0
@@ -122,26 +84,21 @@ def limited(value: int, limit: int) -> int:
     return min(max(value, -limit), limit)
 
 
-@dataclass
 class Station:
-    """See the module. ``sense`` sets the agent's state before each step."""
+    """See the module. ``agent`` gets its state before each step.
 
-    settings: Settings
-    rules: Rules
-    agent: Agent
-    now: Ns
-    rounds: int  # an agent that rests sends at least so often, in rounds
-    on_restart: Callable[[], None] = lambda: None
-    peers: list[Peer] = field(init=False)
+    :param rounds: an agent that rests sends at least so often, in rounds.
+    """
 
-    def __post_init__(self) -> None:
-        c, n, slot_ns = self.settings, self.rules.agents, self.settings.slot_ns
-        anchors, mains = self.rules.anchor_every * n * slot_ns, self.rounds * n * slot_ns
+    def __init__(
+        self, settings: Settings, rules: Rules, agent: Agent, now: Ns, rounds: int,
+        on_restart: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        c, n, slot_ns = settings, rules.agents, settings.slot_ns
+        self.settings, self.rules, self.agent, self.on_restart = c, rules, agent, on_restart
+        anchors, mains = rules.anchor_every * n * slot_ns, rounds * n * slot_ns
         self.peers = [Peer() for _ in range(n)]
-        self.cycle = self.rules.slot_cycle
-        self.head_length = len(c.link.header) + 2 * c.link.says_late + 4 * c.link.names
-        self.frame_length = {"paper": 19, "paper-intent": 23, EXTENDED: 56}[self.rules.profile]
-        self.datagram_length = self.head_length + self.frame_length + (TAG_LENGTH if c.key else 0)
+        self.cycle = rules.slot_cycle
         self.round_ns = anchors
         self.moving_ns, self.resting_ns = max(2 * anchors, HALF_SECOND_NS), max(6 * mains, HALF_SECOND_NS)
         self.patience_ns, self.too_long_ns = max(2 * mains, HALF_SECOND_NS), max(500 * slot_ns, 3 * anchors)
@@ -150,7 +107,7 @@ class Station:
             self.latest_lead_ns, self.too_long_ns = -min(slot_ns * 300 // 1000, 3_000_000), (1 << 63) - 1
         self.latest_send_ns = max(slot_ns - c.link.flight_ns - slot_ns * 200 // 1000, slot_ns // 10)
         self.offsets: list[int] = []
-        self.heard_ns = self.in_step_ns = self.now  # last frame of others, and of the own time; or the beginning
+        self.heard_ns = self.in_step_ns = now  # last frame of others, and of the own time; or the beginning
         self.earlier_since = 0
         self.earlier_ns: Ns | None = None
         self.flight_error_ns, self.name_turn = 0, 0
@@ -159,74 +116,17 @@ class Station:
         self.slot, self.first, self.origin_ns = -1, -1, 0
         self.running = self.awaits = self.newcomer = self.has_sent = self.leaving = self.gone = False
         self.hovers, self.frame, self.counts = HOVERS_LISTENING, b"", Counts()
-        self.early: list[tuple[int, int, bytes]] = []
+        self.early: list[tuple[int, bytes]] = []
         self.sent_history: deque[bytes] = deque(maxlen=SENT_HISTORY_LENGTH)
         if c.begins_ns is not None:
             self.state, self.origin_ns, self.first = JOINED, c.begins_ns, 0
         else:  # spread over a round of anchors: one is the first, and the others hear it while they still listen
-            self.state, self.deadline_ns = LISTENING, self.now + self.round_ns + self._draw(0) % self.round_ns
+            self.state, self.deadline_ns = LISTENING, now + self.round_ns + self._draw(0) % self.round_ns
 
     def _draw(self, what: int) -> int:
         """A number that looks random, of 64 bits."""
-        seed, id = self.settings.seed, self.settings.id
-        return mix64(
-            seed * 0x9E3779B97F4A7C15 + id * 0xD1B54A32D192ED03 + what * 0x8CB92BA72F3D8DD7 - 0x9E3779B97F4A7C15
-        )
-
-    # Datagrams.
-
-    def _parse(self, data: Datagram) -> Parsed | int:
-        """What a datagram says, or why it says nothing."""
-        link, agreed = self.settings.link, len(self.settings.link.header)
-        if agreed == 8 and (len(data) < 3 or data[:3] != link.header[:3]):
-            return NOT_OURS
-        if len(data) < agreed:
-            return WRONG_LENGTH
-        if data[:agreed] != link.header:
-            return OTHER_SETTINGS
-        if len(data) != self.datagram_length:
-            return WRONG_LENGTH
-        times, frame = data[agreed : self.head_length], data[self.head_length :]
-        if len(frame) < 8 or frame[0] >> 4 != 1 or frame[0] & 0xF > 2:
-            return NO_FRAME
-        sender = frame[1] if frame[0] & 0xF == 2 else int.from_bytes(frame[1:3], "little")
-        slot = int.from_bytes(frame[4:8], "little")
-        if not 1 <= sender <= self.rules.agents:
-            return UNKNOWN_AGENT
-        if self.settings.key:
-            frame, tag = frame[:-TAG_LENGTH], frame[-TAG_LENGTH:]
-            if self._tag(slot, frame + times) != tag:
-                return REJECTED
-        if slot >= self.cycle:
-            return NO_FRAME
-        if not self.settings.key:
-            try:
-                decode(frame, self.rules.position_step)
-            except Refused:
-                return NO_FRAME
-        late = int.from_bytes(times[:2], "little") * LATE_UNIT_NS if link.says_late else 0
-        at = times[2 * link.says_late :]
-        names = [
-            (int.from_bytes(at[i : i + 2], "little"), int.from_bytes(at[i + 2 : i + 4], "little", signed=True))
-            for i in range(0, len(at), 4)
-        ]
-        return Parsed(sender, slot, late, tuple((k, by * LATE_UNIT_NS) for k, by in names), frame)
-
-    def _write(self, late_ns: int, now: Ns) -> Datagram:
-        link = self.settings.link
-        times = min(max(late_ns // LATE_UNIT_NS, 0), 0xFFFF).to_bytes(2, "little") if link.says_late else b""
-        named = self._names(now)
-        for k, by in named + [(0, 0)] * (link.names - len(named)):
-            units = min(max(by // LATE_UNIT_NS, -0x8000), 0x7FFF)
-            times += k.to_bytes(2, "little") + units.to_bytes(2, "little", signed=True)
-        code = self._tag(self.rules.slot_on_air(self.slot), self.frame + times) if self.settings.key else b""
-        return link.header + times + self.frame + code
-
-    def _tag(self, slot: int, covered: bytes) -> bytes:
-        """The code that only holders of the key can make."""
-        begin = self.settings.session.to_bytes(8, "little") + slot.to_bytes(8, "little")
-        key, person = self.settings.key, b"dtsa v1"
-        return hashlib.blake2s(begin + covered, key=key, digest_size=TAG_LENGTH, person=person).digest()
+        mixed = self.settings.seed * 0x9E3779B97F4A7C15 + self.settings.id * 0xD1B54A32D192ED03
+        return mix64(mixed + what * 0x8CB92BA72F3D8DD7 - 0x9E3779B97F4A7C15)
 
     # When slots begin.
 
@@ -236,16 +136,16 @@ class Station:
     def _slot_at(self, now: Ns) -> int:
         return (now - self.origin_ns) // self.settings.slot_ns
 
-    def _apart(self, a_ns: Ns, b_ns: Ns) -> int:
-        return centred(a_ns - b_ns, self.cycle * self.settings.slot_ns)
+    def _apart(self, a_ns: Ns, b_ns: Ns | None = None) -> int:
+        """How much later than another origin one is; without another: than the own."""
+        return centred(a_ns - (self.origin_ns if b_ns is None else b_ns), self.cycle * self.settings.slot_ns)
 
-    def _is_same(self, a_ns: Ns, b_ns: Ns) -> bool:
+    def _is_same(self, a_ns: Ns, b_ns: Ns | None = None) -> bool:
         return abs(self._apart(a_ns, b_ns)) <= self.settings.link.trust_ns
 
     def _is_near(self, origin_ns: Ns) -> bool:
         """Whether slots agree, if their numbers count from there."""
-        half = self.settings.slot_ns // 2
-        return -half < self._apart(origin_ns, self.origin_ns) < half
+        return abs(self._apart(origin_ns)) < self.settings.slot_ns // 2
 
     def _align(self, offset_ns: int) -> int:
         """By how much the own slots move: half the median of some frames' offsets."""
@@ -254,8 +154,7 @@ class Station:
             return 0
         median = sorted(self.offsets)[RECEPTIONS // 2]
         self.offsets.clear()
-        size = (abs(median) + 1) // 2  # half away from zero: both directions weigh the same
-        return size if median >= 0 else -size
+        return (abs(median) + 1) // 2 * (1 if median >= 0 else -1)  # rounded away from zero: no direction is preferred
 
     def _yields_to(self, origin_ns: Ns, now: Ns) -> bool:
         """Whether the time that a frame shows is taken over.
@@ -266,9 +165,9 @@ class Station:
         """
         recent = [p for p in self.peers if self._is_recent(p, p.heard_ns, now)]
         every = 1 + len(recent)
-        here = 1 + sum(self._is_same(p.origin_ns, self.origin_ns) for p in recent)
+        here = 1 + sum(self._is_same(p.origin_ns) for p in recent)
         in_other_time = sum(p.steady and self._is_same(p.origin_ns, origin_ns) for p in recent)
-        earlier = self._apart(origin_ns, self.origin_ns) < 0
+        earlier = self._apart(origin_ns) < 0
         if 2 * in_other_time > every or (earlier and (self.state == ALONE or 2 * in_other_time == every)):
             return True
         if not in_other_time:
@@ -294,10 +193,10 @@ class Station:
         if self.state == LISTENING:
             self._adopt_time(origin_ns, arrival)
             return RESTARTED
-        apart, near = self._apart(origin_ns, self.origin_ns), self._is_near(origin_ns)
+        apart, near = self._apart(origin_ns), self._is_near(origin_ns)
         if near:
             p.near_ns = arrival
-        if self._is_same(origin_ns, self.origin_ns):
+        if self._is_same(origin_ns):
             if self.settings.keeps_time != KEEPS_STARTS:
                 self.origin_ns += self._align(apart)
             self.in_step_ns, self.state = arrival, JOINED
@@ -336,10 +235,10 @@ class Station:
     def _names(self, now: Ns) -> list[tuple[int, int]]:
         """Return heard agents in turn, by id, beginning with the last one: ids between two neighbours are not heard."""
         heard = [k for k, p in enumerate(self.peers) if p.offset_ns is not None and self._hears(p, now)]
-        count, turn = min(len(heard), self.settings.link.names), self.name_turn
-        named = [heard[(turn + i) % len(heard)] for i in range(count)]
+        count = min(len(heard), self.settings.link.names)
+        named = [heard[(self.name_turn + i) % len(heard)] for i in range(count)]
         if heard:
-            self.name_turn = (turn % len(heard) + (count - 1 if count > 1 else count)) % len(heard)
+            self.name_turn = (self.name_turn + (count - 1 if count > 1 else count)) % len(heard)
         return [(k + 1, self.peers[k].offset_ns or 0) for k in named]
 
     # Which agents hear each other.
@@ -351,7 +250,7 @@ class Station:
         return not p.left and self._is_recent(p, p.near_ns, now)
 
     def _hear_contact(self, p: Peer, d: Parsed) -> None:
-        extended, most = d.frame[0] & 0xF == 2, self.settings.link.names
+        extended, most = d.frame[0] & 0xF == PROFILE_EXTENDED, self.settings.link.names
         p.left = extended and d.frame[2] == LEAVING
         p.resting = not d.frame[3] & MOVES or bool(d.frame[3] & PROBATION) if extended else not d.frame[3]
         if not most:
@@ -410,7 +309,7 @@ class Station:
         try:
             parsed, sampled = parse(frame, slot, self.rules)
             if self.agent.present:
-                hear([Receiver(self.agent.table, self.agent)], parsed, sampled, self.rules)
+                hear([self.agent], parsed, sampled, self.rules)
         except (Refused, Foreign):
             pass
         if self.awaits and slot >= self.slot:
@@ -418,10 +317,9 @@ class Station:
 
     def _find_hover_reason(self, slot: int, now: Ns) -> int:
         quorum = self._has_quorum(now)
-        on_probation = self.rules.policy == "lease" and self.agent.memory.probation
         if self._has_id_conflict(now):
             return HOVERS_SAME_ID
-        if self.has_sent and slot >= self.first + self.rules.agents and not on_probation:
+        if self.has_sent and slot >= self.first + self.rules.agents and not self.agent.memory.probation:
             self.newcomer = False
         if self.newcomer:
             return HOVERS_NEW
@@ -451,16 +349,14 @@ class Station:
         if self.frame and self._withholds_frame(slot, now):
             self.pending = self.frame = b""
         self.running, self.awaits = True, chosen not in (0, self.settings.id)
-        early, self.early = self.early, []
-        for entry in early:
-            if entry[0] > slot:
-                self.early.append(entry)
-            else:
-                self._receive_frame(entry[0], entry[2])
+        due = [entry for entry in self.early if entry[0] <= slot]
+        self.early = [entry for entry in self.early if entry[0] > slot]
+        for entry in due:
+            self._receive_frame(*entry)
 
-    def receive(self, data: Datagram, arrival: Ns) -> int:
+    def receive(self, data: bytes, arrival: Ns) -> int:
         """Receive a datagram, of any bytes; return ACCEPTED, or why it is refused."""
-        d = self._parse(data)
+        d = parse_datagram(data, self.settings, self.rules)
         if isinstance(d, int):
             return d
         c, slot_ns = self.settings, self.settings.slot_ns
@@ -487,12 +383,12 @@ class Station:
         self._hear_contact(p, d)
         if slot > self.slot:
             if len(self.early) < c.early_count:
-                self.early.append((slot, d.sender, d.frame))
+                self.early.append((slot, d.frame))
         elif slot >= self.first - 1:
             self._receive_frame(slot, d.frame)
         return ACCEPTED
 
-    def _classify_own_id(self, data: Datagram, arrival: Ns, apart: int) -> int:
+    def _classify_own_id(self, data: bytes, arrival: Ns, apart: int) -> int:
         """Classify a datagram with the own id: echo or replay of an own one, or another agent with that id."""
         half = self.settings.slot_ns // 2
         if data in self.sent_history:
@@ -511,7 +407,7 @@ class Station:
         must_decide = self.awaits and now >= following - self.lead_ns
         return following - (self.latest_lead_ns if must_decide else self.lead_ns)
 
-    def step(self, now: Ns) -> tuple[Ns, Datagram]:
+    def step(self, now: Ns) -> tuple[Ns, bytes]:
         """Do one step that is due; return when to call again (not after now: at once), and the datagram to send."""
         datagram, due = b"", self._due_ns(now)
         if now < due:
@@ -529,11 +425,12 @@ class Station:
             self._open_slot(self.slot + 1, now)
         return self._due_ns(now), datagram
 
-    def _send(self, late_ns: int, now: Ns) -> Datagram:
+    def _send(self, late_ns: int, now: Ns) -> bytes:
         if late_ns > self.latest_send_ns:  # it would disturb the next turn
             self.frame = self.pending = b""
             return b""
-        datagram = self._write(late_ns, now)
+        slot = self.rules.slot_on_air(self.slot)
+        datagram = write_datagram(self.settings, self.frame, slot, late_ns, self._names(now))
         self.gone = self.leaving and self.frame[2] == LEAVING
         self.frame, self.has_sent = b"", True
         self.sent_history.append(datagram)
@@ -556,12 +453,3 @@ class Station:
         else:
             self.agent.present, self.gone = OFF, True
             self.agent.restart()
-
-
-def names_hear(agent: int, names: Sequence[int], most: int) -> int:
-    """Whether the sender of a list of names hears an agent: 1, -1, or 0: the list does not tell."""
-    if agent in names:
-        return 1
-    if len(names) < most:  # all whom it hears
-        return -1
-    return -1 if any((agent - a) & 0xFFFF < (b - a) & 0xFFFF for a, b in pairwise(names)) else 0

@@ -20,7 +20,7 @@ from dtsa_agent.core.settings.flight_models import flight_model
 from dtsa_agent.core.settings.scenario import Scenario, policy_key
 from dtsa_agent.core.swarm import Bytes, Swarm
 
-from .agent import Agent, Foreign, Receiver, hear, parse
+from .agent import Agent, Foreign, hear, parse
 from .arithmetic import Vector
 from .estimators import ESTIMATORS
 from .lease.memory import DEAF
@@ -32,7 +32,7 @@ def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
     same = {field.name: getattr(config, field.name) for field in fields(Rules) if hasattr(config, field.name)}
     return Rules(**{
         **same, "tau": flight_model(config.avoider, config.options).vehicle.tau, "key": policy_key(config.seed),
-        "profile": PROFILES[2 if config.extended else 1 if config.estimator_row.needs_intent else 0],
+        "profile": PROFILES[config.profile],
         "position_step": position_step(config.extent_m), "open_every": config.open_period,
         "targets_known": config.targets_known and scenario.goals_known,
     })  # fmt: skip
@@ -111,14 +111,13 @@ class ReferenceSwarm(Swarm):
             return False
         self._read_arrays()
         extended = self.config.extended
-        sender = data[1] if extended else int.from_bytes(data[1:3], "little")
         reached = [
             place
             for place, agent in enumerate(self.agents)
             if (mask is None or mask[place])
-            and not (extended and (agent.index + 1 == sender or not (agent.present or self.shares)))
+            and not (extended and (agent.index + 1 == frame.own.sender or not (agent.present or self.shares)))
         ]
-        hear([Receiver(self.agents[place].table, self.agents[place]) for place in reached], frame, sampled, self.rules)
+        hear([self.agents[place] for place in reached], frame, sampled, self.rules)
         for place in reached:
             self._publish(place)
         return True

@@ -11,7 +11,7 @@ from dtsa_agent.core.frame import Frame
 from .arithmetic import ZERO, Vector, bits_of, minus, mix64, norm1
 
 OFF, ON, LEAVES = 0, 1, 2  # of an agent: not there, there, about to be switched off
-PAPER, PAPER_INTENT, EXTENDED = "paper", "paper-intent", "extended"  # profiles of frames
+PROFILES = PAPER, PAPER_INTENT, EXTENDED = "paper", "paper-intent", "extended"  # of frames
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from dtsa_agent.core.frame import (
     PROFILE_PAPER,
     PROFILE_PAPER_INTENT,
     TAG_LENGTH,
-)
+)  # fmt: skip
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, SELECTIONS, EstimatorRow, PolicyRow, Registry
 
 from .declaration import Settings, check, setting
@@ -41,126 +41,70 @@ class SwarmConfig(Settings):
     :raises ConfigError: at creation, naming the field, the value and what is allowed.
     """
 
+    # fmt: off
     agents: int = setting(12, "number of agents, N = |A|", minimum=1, maximum=MAX_AGENTS, group="The swarm")
-    moving: int | None = setting(
-        None,
-        "how many of them move, in antipodal pairs, an odd one to a far point of its own; default: all in pairs",
-        minimum=0,
-        maximum=MAX_AGENTS,
-    )
-    policy: str = setting(
-        "dtsa", "rule by which agents decide which agent sends", choices=POLICIES.names, open_choices=True
-    )
+    moving: int | None = setting(None, "how many of them move, in antipodal pairs, an odd one to a far point of its "
+        "own; default: all in pairs", minimum=0, maximum=MAX_AGENTS)
+    policy: str = setting("dtsa", "rule by which agents decide which agent sends", choices=POLICIES.names,
+        open_choices=True)
     estimator: str = setting("linear", "where the others are by now", choices=ESTIMATORS.names, open_choices=True)
-    avoider: str = setting(
-        "orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS.names, open_choices=True
-    )
-    slot_ms: float = setting(10.0, "length of a time slot, t_s", unit="ms", minimum=0.3, maximum=1000)
+    avoider: str = setting("orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS.names,
+        open_choices=True)
+    slot_ms: float = setting(10.0, "length of a time slot, t_s", "ms", 0.3, 1000)
     seed: int = setting(1, "seed of the whole run", minimum=0, maximum=2**63 - 1)
 
-    epsilon: float = setting(
-        0.5,
-        "least relative difference of priorities that counts (eq:pfs)",
-        minimum=0,
-        maximum=1,
-        group="Priority and selection",
-    )
+    epsilon: float = setting(0.5, "least relative difference of priorities that counts (eq:pfs)", minimum=0, maximum=1,
+        group="Priority and selection")
     selection: str = setting("candidates", "reading of the selection function", choices=SELECTIONS)
     boot_round: bool = setting(True, "everyone sends once, in id order, before priorities decide")
-    age_cap: float = setting(
-        1.5, "an agent silent for age_cap * N_p slots goes first; 0: never (the paper's text)", minimum=0, maximum=1000
-    )
-    return_every: int = setting(
-        20,
-        "one of so many slots belongs to an agent outside A_p; 0: none (the paper's text)",
-        minimum=0,
-        maximum=100000,
-    )
-    r_min: float = setting(
-        0.3,
-        "distance to the target at which an agent has arrived (eq:remaining_t_slots)",
-        unit="m",
-        minimum=0.001,
-        maximum=100,
-    )
+    age_cap: float = setting(1.5, "an agent silent for age_cap * N_p slots goes first; 0: never (the paper's text)",
+        minimum=0, maximum=1000)
+    return_every: int = setting(20, "one of so many slots belongs to an agent outside A_p; 0: none (the paper's text)",
+        minimum=0, maximum=100000)
+    r_min: float = setting(0.3, "distance to the target at which an agent has arrived (eq:remaining_t_slots)", "m",
+        0.001, 100)
     c_r: int = setting(1, "the constant C sent while not arrived (eq:remaining_t_slots)", minimum=1, maximum=255)
     targets_known: bool = setting(True, "all know all targets: an agent that has arrived is taken to stand there")
 
-    frame: str = setting(
-        "auto",
-        "frames on the air; auto: extended with policy lease, else paper",
-        choices=FRAMES,
-        group="Frames and leases",
-    )
-    extent_m: float = setting(
-        EXTENT_M,
-        "largest coordinate that frames can say, half of it in gossip; scales the steps of positions: 2 mm by default",
-        unit="m",
-        minimum=1,
-        maximum=10000,
-    )
+    frame: str = setting("auto", "frames on the air; auto: extended with policy lease, else paper", choices=FRAMES,
+        group="Frames and leases")
+    extent_m: float = setting(EXTENT_M, "largest coordinate that frames can say, half of it in gossip; scales the "
+        "steps of positions: 2 mm by default", "m", 1, 10000)
     gossip: bool = setting(True, "extended frames carry what their sender last heard of others")
-    anchor_every: int = setting(
-        3,
-        "lease: every so many rounds an agent's turn is an anchor: no other agent gives it away, M",
-        minimum=1,
-        maximum=MOST_ROUNDS,
-    )
-    anchor_rest: int = setting(
-        5,
-        "lease: an agent that knows that it will rest gives all but one of so many anchors away, K; K M is at most 15, "
-        "M without open turns or adoption",
-        minimum=1,
-        maximum=MOST_ROUNDS,
-    )
-    open_every: int = setting(
-        11,
-        "lease: one of so many turns of resting agents is open to all that start moving, S (at least N / 5); 0: none",
-        minimum=0,
-        maximum=1000,
-    )
+    anchor_every: int = setting(3, "lease: every so many rounds an agent's turn is an anchor: no other agent gives "
+        "it away, M", minimum=1, maximum=MOST_ROUNDS)
+    anchor_rest: int = setting(5, "lease: an agent that knows that it will rest gives all but one of so many anchors "
+        "away, K; K M is at most 15, M without open turns or adoption", minimum=1, maximum=MOST_ROUNDS)
+    open_every: int = setting(11, "lease: one of so many turns of resting agents is open to all that start moving, S "
+        "(at least N / 5); 0: none", minimum=0, maximum=1000)
     adoption: bool = setting(True, "lease: the turns of the dead are given away by the next agent alive")
     depth_rate: float = setting(0.5, "lease: turns given away ahead, per round of idleness, c", minimum=0, maximum=15)
-    lease_share: float = setting(
-        1.0, "lease: no leases when more than this share of the agents has something to say", minimum=0, maximum=1
-    )
+    lease_share: float = setting(1.0, "lease: no leases when more than this share of the agents has something to say",
+        minimum=0, maximum=1)
 
-    auth: bool = setting(
-        False,
-        "frames carry a 4-byte code that only holders of the key can make; the key is in the "
-        "environment: DTSA_AUTH_KEY, 32 to 64 hexadecimal digits",
-        group="Authentication",
-    )
-    auth_session: int = setting(
-        0,
-        "number of the flight for that code, so that frames of other flights are none of this; 0: nodes take a random "
-        "one for each flight; agents on a network, which have no node to draw it, refuse 0",
-        minimum=0,
-        maximum=2**63 - 1,
-    )
+    auth: bool = setting(False, "frames carry a 4-byte code that only holders of the key can make; the key is in the "
+        "environment: DTSA_AUTH_KEY, 32 to 64 hexadecimal digits", group="Authentication")
+    auth_session: int = setting(0, "number of the flight for that code, so that frames of other flights are none of "
+        "this; 0: nodes take a random one for each flight; agents on a network, which have no node to draw it, "
+        "refuse 0", minimum=0, maximum=2**63 - 1)
 
     scenario: str = setting("exchange", "what the swarm does", choices=SCENARIOS, group="What it does")
     shape: str = setting("circle", "where the agents start", choices=SHAPES)
-    axis_x_m: float = setting(
-        0.0, "half axis of the start shape in x; 0: from the number of agents", unit="m", minimum=0, maximum=1000
-    )
-    axis_y_m: float = setting(0.0, "half axis in y; 0: as x (circle) or 5/3 of x", unit="m", minimum=0, maximum=1000)
-    axis_z_m: float = setting(0.0, "half axis in z (ellipsoid); 0: as x", unit="m", minimum=0, maximum=1000)
-    jitter_m: float = setting(
-        0.05, "starts are moved at random by up to this in x, y and z", unit="m", minimum=0, maximum=1
-    )
+    axis_x_m: float = setting(0.0, "half axis of the start shape in x; 0: from the number of agents", "m", 0, 1000)
+    axis_y_m: float = setting(0.0, "half axis in y; 0: as x (circle) or 5/3 of x", "m", 0, 1000)
+    axis_z_m: float = setting(0.0, "half axis in z (ellipsoid); 0: as x", "m", 0, 1000)
+    jitter_m: float = setting(0.05, "starts are moved at random by up to this in x, y and z", "m", 0, 1)
     permute: bool = setting(True, "ids are dealt out at random around the shape")
-    places: str = setting(
-        "", "where each agent begins: by id, the number of a place around the shape; empty: see permute"
-    )
+    places: str = setting("", "where each agent begins: by id, the number of a place around the shape; empty: see "
+        "permute")
     stagger_slots: int = setting(100, "staggered: slots between the starts of two pairs", minimum=0, maximum=100000)
     stops: int = setting(2, "waypoints, stop-and-go: goals on the way to the last one", minimum=1, maximum=100)
     pause_slots: int = setting(50, "waypoints, stop-and-go: slots of rest at each of them", minimum=0, maximum=1000000)
     announce: bool = setting(True, "an agent with a new goal does not move before it has sent a frame that says so")
-    control_ms: float = setting(10.0, "longest control period", unit="ms", minimum=0.5, maximum=100)
-    options: Mapping[str, float] = setting(
-        {}, "values that replace those of the flight model, by name; those of a plug-in as plug-in.option"
-    )
+    control_ms: float = setting(10.0, "longest control period", "ms", 0.5, 100)
+    options: Mapping[str, float] = setting({}, "values that replace those of the flight model, by name; those of a "
+        "plug-in as plug-in.option")
+    # fmt: on
 
     def __post_init__(self) -> None:
         check(self)
@@ -172,51 +116,42 @@ class SwarmConfig(Settings):
         ESTIMATORS.row(self.estimator)
         flight_model(self.avoider, self.options)
         self._check_plug_in_options()
-        if self.policy_row.extended and self.frame == "paper":
-            raise ConfigError("frame", self.frame, f"auto or extended with policy {self.policy}")
-        self._check_agents()
+        self._check_frames()
         if self.places and sorted(self.place_numbers) != list(range(1, self.agents + 1)):
             raise ConfigError("places", self.places, f"the numbers 1 to {self.agents}, each once, in any order")
-        self._check_own_bytes()
 
     def _check_plug_in_options(self) -> None:
         """Check that plug-ins declare the options with a dot, also those of plug-ins that do not fly."""
         for key in self.options:
             owner = key.rpartition(".")[0]
-            flying = [
-                registry
-                for registry in _REGISTRIES
-                if getattr(self, registry.kind) == owner and owner not in registry.rows
-            ]
+            flying = [r for r in _REGISTRIES if getattr(self, r.kind) == owner and owner not in r.rows]
             if not owner or (not flying and key in _ACCEPTED):
                 continue
             owners = flying or [registry for registry in _REGISTRIES if owner in registry.plug_in_names()]
             if not owners:
                 names = ", ".join(sorted({name for registry in _REGISTRIES for name in registry.plug_in_names()}))
                 raise ConfigError("options", key, f"the name of a plug-in before the dot; {names}")
-            declared = {
-                f"{owner}.{option}" for registry in owners for option in _declared(owner, registry.factory(owner))
-            }
+            declared = sorted(f"{owner}.{word}" for r in owners for word in _declared(owner, r.factory(owner)))
             if key not in declared:
                 nothing = f"none: {owner} declares no options (class attribute options)"
-                raise ConfigError("options", key, ", ".join(sorted(declared)) or nothing)
+                raise ConfigError("options", key, ", ".join(declared) or nothing)
             if not flying:
                 _ACCEPTED.add(key)
 
-    def _check_agents(self) -> None:
-        """Check that ids fit into frames."""
+    def _check_frames(self) -> None:
+        """Check that ids, and what plug-ins append, fit into frames."""
+        row, estimator = self.policy_row, self.estimator_row
+        if row.extended and self.frame == "paper":
+            raise ConfigError("frame", self.frame, f"auto or extended with policy {self.policy}")
         if self.extended and self.agents > MAX_EXTENDED_AGENTS:
             allowed = f"1 to {MAX_EXTENDED_AGENTS} with extended frames, whose ids have 8 bits"
             others = [row.name for row in POLICIES.rows.values() if not row.extended]
-            instead = f"policy {', '.join(others)}" if self.policy_row.extended else "frame: paper"
+            instead = f"policy {', '.join(others)}" if row.extended else "frame: paper"
             raise ConfigError("agents", self.agents, f"{allowed}; up to {MAX_AGENTS} with {instead}")
-
-    def _check_own_bytes(self) -> None:
-        """Check that frames with what plug-ins append to them fit into a packet."""
-        profile = PROFILE_EXTENDED if self.extended else PROFILE_PAPER_INTENT
-        room = FRAME_MAX - LENGTHS[profile] - (TAG_LENGTH if self.auth else 0)
+        tag = TAG_LENGTH if self.auth else 0
+        room = FRAME_MAX - LENGTHS[PROFILE_EXTENDED if self.extended else PROFILE_PAPER_INTENT] - tag
         if self.own_bytes > room:
-            names = " and ".join(row.name for row in (self.policy_row, self.estimator_row) if row.own_bytes)
+            names = " and ".join(part.name for part in (row, estimator) if part.own_bytes)
             raise ConfigError(f"own_bytes of {names}", self.own_bytes, f"0 to {room} with these frames")
 
     @property
@@ -231,18 +166,18 @@ class SwarmConfig(Settings):
         return self.policy_row.own_bytes + self.estimator_row.own_bytes
 
     @property
+    def profile(self) -> int:
+        """Number of the profile of frames."""
+        paper = PROFILE_PAPER_INTENT if self.estimator_row.needs_intent else PROFILE_PAPER
+        return PROFILE_EXTENDED if self.extended else paper
+
+    @property
     def frame_length(self) -> int:
         """Length of each frame on the air, bytes, with what plug-ins and authentication append."""
-        intent = PROFILE_PAPER_INTENT if self.estimator_row.needs_intent else PROFILE_PAPER
-        profile = PROFILE_EXTENDED if self.extended else intent
-        return LENGTHS[profile] + self.own_bytes + (TAG_LENGTH if self.auth else 0)
+        return LENGTHS[self.profile] + self.own_bytes + (TAG_LENGTH if self.auth else 0)
 
     def protocol_part(self, data: bytes, sealed: bool = False) -> bytes:
-        """What policy and estimator say in a frame: without what plug-ins and authentication append to it.
-
-        :param data: a frame.
-        :param sealed: whether it is as the air carries it, with a tag if frames are authenticated.
-        """
+        """A frame without what plug-ins, and where it is sealed authentication, append to it."""
         return data[: max(0, len(data) - self.own_bytes - (TAG_LENGTH if sealed and self.auth else 0))]
 
     @property
@@ -309,10 +244,7 @@ def _declared(name: str, factory: Any) -> Iterable[str]:
 
 
 def agreed_settings(config: SwarmConfig, mode: str) -> dict[str, Any]:
-    """The settings that all processes of a flight must share, as plain values.
-
-    :param mode: lockstep, realtime, or udp: over a network.
-    """
+    """The settings that all processes of a flight (mode lockstep, realtime or udp) must share, as plain values."""
     values = {**config.to_dict(), "steps": config.steps, "mode": mode}
     return dict(json.loads(json.dumps(values, sort_keys=True, default=str)))
 

@@ -20,8 +20,11 @@ from dtsa_agent.core.errors import SETTING_NAMES, ConfigError, range_text
 REQUIRED: Any = dataclasses.MISSING
 
 _KIND_OF_TYPE = {"int": "int", "float": "float", "bool": "bool", "str": "text", "Vector": "vector"}
-_NUMBERS = {"int": "a whole number", "float": "a number"}
-_WORDS = {"bool": "true or false", "text": "a text", "values": "name=number, separated by commas"}
+_NUMBERS = ("int", "float")
+_WORDS = {
+    "int": "a whole number", "float": "a number", "bool": "true or false", "text": "a text", "vector": "three numbers",
+    "values": "name=number, separated by commas",
+}  # fmt: skip
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _BOOLS = {**dict.fromkeys(("true", "yes", "on", "1"), True), **dict.fromkeys(("false", "no", "off", "0"), False)}
 
@@ -63,33 +66,33 @@ class Setting:
     @property
     def range(self) -> str:
         """The range in words; empty if there is none."""
-        if self.minimum is None and self.maximum is None:
-            return ""
-        return range_text(self.minimum, self.maximum, self.unit)
+        has_range = self.minimum is not None or self.maximum is not None
+        return range_text(self.minimum, self.maximum, self.unit) if has_range else ""
 
     @property
     def allowed(self) -> str:
         """What may be given, in words."""
         if self.choices:
             return ", ".join(map(str, self.choices))
-        if self.custom:
+        words = _WORDS.get(self.kind, self.help)
+        if self.custom or self.kind in ("file", "structure"):
             return self.help
-        if self.kind == "vector":
-            return f"three numbers: x, y, z in {self.unit}" if self.unit else "three numbers"
+        if self.kind == "vector" and self.unit:
+            return f"{words}: x, y, z in {self.unit}"
         if self.kind not in _NUMBERS:
-            return _WORDS.get(self.kind, self.help)
-        if not self.range:
-            return _NUMBERS[self.kind] + (f", {self.unit}" if self.unit else "")
-        return self._allowed_range if self._bare else f"{_NUMBERS[self.kind]}, {self.range}"
+            return words
+        if self.range:
+            return self._number_range if self._is_bare else f"{words}, {self.range}"
+        return f"{words}, {self.unit}" if self.unit else words
 
     @property
-    def _bare(self) -> bool:
+    def _is_bare(self) -> bool:
         return self.kind == "float" and self.unit in ("", "1")
 
     @property
-    def _allowed_range(self) -> str:
+    def _number_range(self) -> str:
         """The range; "0 to 1" of numbers without a unit would be read as two whole numbers."""
-        return f"a number from {self.range}" if self._bare and self.minimum is not None else self.range
+        return f"a number from {self.range}" if self._is_bare and self.minimum is not None else self.range
 
     def check(self, value: Any, name: str | None = None) -> Any:
         """The value as the configuration keeps it: whole numbers become floats where floats are meant.
@@ -100,45 +103,29 @@ class Setting:
         """
         if value is None and self.optional:
             return None
-        name = name or self.name
+        name, words = name or self.name, self.choices
         if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
             value = value.item()
-        if self.kind in _NUMBERS:
-            return self._number(value, name)
         if self.kind == "values":
             return _checked_values(value, name)
         if self.section and not isinstance(value, self.section):
             raise ConfigError(name, value, "names with values")
-        if self.kind == "vector":
-            right = isinstance(value, (list, tuple)) and len(value) == 3 and all(map(_is_number, value))
-        elif self.kind == "text":
-            right = isinstance(value, str) and (not self.words or self.open_choices or value in self.choices)
-        else:
-            right = self.kind != "bool" or isinstance(value, bool)
-        if not right:
-            raise ConfigError(name, value, self.allowed)
-        return tuple(map(float, value)) if self.kind == "vector" else value
-
-    def _number(self, value: Any, name: str) -> int | float:
         if self.kind == "int" and isinstance(value, float) and value.is_integer():
             value = int(value)
-        if isinstance(value, bool) or not isinstance(value, int if self.kind == "int" else (int, float)):
+        if not _IS_KIND.get(self.kind, lambda _: True)(value):
             raise ConfigError(name, value, self.allowed)
-        low, high = self.minimum, self.maximum
-        if not math.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
-            raise ConfigError(name, value, self._allowed_range or self.allowed)
-        if self.words and value not in self.choices:
+        if self.kind in _NUMBERS:
+            low, high = (value if bound is None else bound for bound in (self.minimum, self.maximum))
+            if not (math.isfinite(value) and low <= value <= high):
+                raise ConfigError(name, value, self._number_range or self.allowed)
+        if words and not self.open_choices and value not in words:
             raise ConfigError(name, value, self.allowed)
-        return float(value) if self.kind == "float" else int(value)
+        return _KEPT[self.kind](value) if self.kind in _KEPT else value
 
     def parse(self, text: str) -> Any:
         """The value that a text means. Its range is checked by the configuration itself."""
-        readers: dict[str, Callable[[str], Any]] = {
-            "text": str, "file": str, "int": int, "float": float, "values": parse_values,
-            "bool": lambda text: _BOOLS[text.lower()],
-        }  # fmt: skip
         try:
-            return readers[self.kind](text)
+            return _READERS[self.kind](text)
         except (KeyError, ValueError):
             raise ConfigError(self.name, text, self.allowed) from None
 
@@ -150,11 +137,12 @@ class Setting:
             raise ConfigError(self.name, text, self.allowed) from None
 
 
-def setting(default: Any, help: str, *, kind: str = "", choices: Choices = (), **more: Any) -> Any:
+def setting(
+    default: Any, help: str, unit: str = "", minimum: float | None = None, maximum: float | None = None, *,
+    kind: str = "", choices: Choices = (), **more: Any,
+) -> Any:  # fmt: skip
     """A field of a settings class; without ``kind`` that of its annotation. ``more``: fields of :class:`Setting`."""
-    if not isinstance(choices, tuple) and not callable(choices):
-        raise TypeError(f"choices: a tuple or a function, not {choices!r}")
-    metadata = {"setting": Setting("", kind, None, help, words=choices, **more)}
+    metadata = {"setting": Setting("", kind, None, help, unit, minimum, maximum, choices, **more)}
     if isinstance(default, dict):
         return dataclasses.field(default_factory=dict, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
@@ -188,8 +176,7 @@ def settings_of(cls: type) -> tuple[Setting, ...]:
                 group=own.group or (result[-1].group if result else ""),
             )
         )  # fmt: skip
-    _described[cls] = tuple(result)
-    return _described[cls]
+    return _described.setdefault(cls, tuple(result))
 
 
 class Settings:
@@ -204,7 +191,7 @@ class Settings:
         check(self)
 
     def __repr__(self) -> str:
-        """The settings without those that have their defaults, for classes whose dataclass leaves it to this one."""
+        """The settings that differ from their defaults, for classes whose dataclass leaves it to this one."""
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.not_default().items())})"
 
     def not_default(self) -> dict[str, Any]:
@@ -214,7 +201,7 @@ class Settings:
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain values; :meth:`from_dict` reads them back."""
-        return {spec.name: _plain(getattr(self, spec.name)) for spec in settings_of(type(self))}
+        return {spec.name: plain(getattr(self, spec.name)) for spec in settings_of(type(self))}
 
     @classmethod
     def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
@@ -268,18 +255,31 @@ def names_with_values(value: object, name: str) -> Mapping[str, Any]:
     return value
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A value as JSON and YAML have it."""
     if isinstance(value, (str, int, float)) or value is None:
         return value
     if isinstance(value, Mapping):
-        return {name: _plain(item) for name, item in value.items()}
+        return {name: plain(item) for name, item in value.items()}
     if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value.to_dict() if hasattr(value, "to_dict") else value
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_vector(value: Any) -> bool:
+    is_triple = isinstance(value, (list, tuple)) and len(value) == 3
+    return is_triple and all(_is_number(x) and math.isfinite(x) for x in value)
+
+
+_IS_KIND: dict[str, Callable[[Any], bool]] = {
+    "int": lambda value: isinstance(value, int) and not isinstance(value, bool), "float": _is_number,
+    "bool": lambda value: isinstance(value, bool), "text": lambda value: isinstance(value, str), "vector": _is_vector,
+}  # fmt: skip
+_KEPT: dict[str, Callable[[Any], Any]] = {"float": float, "int": int, "vector": lambda value: tuple(map(float, value))}
 
 
 def _checked_values(value: object, name: str) -> dict[str, float]:
@@ -287,7 +287,7 @@ def _checked_values(value: object, name: str) -> dict[str, float]:
     for key, number in values.items():
         if not isinstance(key, str) or not _NAME.fullmatch(key):
             raise ConfigError(name, key, "names of letters, digits, dots, dashes and underscores")
-        if not _is_number(number):
+        if not _is_number(number) or not math.isfinite(number):
             raise ConfigError(f"{name}.{key}", number, "a number")
     return {key: float(number) for key, number in values.items()}
 
@@ -306,3 +306,9 @@ def parse_values(text: str) -> dict[str, float]:
 def format_values(values: Mapping[str, float]) -> str:
     """The text that :func:`parse_values` reads back."""
     return ", ".join(f"{name}={value!r}" for name, value in values.items())
+
+
+_READERS: dict[str, Callable[[str], Any]] = {
+    "text": str, "file": str, "int": int, "float": float, "values": parse_values,
+    "bool": lambda text: _BOOLS[text.lower()],
+}  # fmt: skip

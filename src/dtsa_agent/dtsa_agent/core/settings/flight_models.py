@@ -28,29 +28,21 @@ KINDS = NAMES["avoiders"]  # of libdtsa, in the order of their numbers
 class AvoiderParams(Settings):
     """Parameters of the avoiders; which of them count depends on the avoider."""
 
-    v_max: float = setting(1.5, "largest commanded speed", unit="m/s", minimum=0.01, maximum=20)
-    gain: float = setting(2.0, "K_P: speed towards the goal per distance to it", unit="1/s", minimum=0.01, maximum=100)
-    radius: float = setting(0.336, "orca: R_c, of a pair; bvc: of one agent", unit="m", minimum=0.01, maximum=10)
-    horizon: float = setting(
-        1.0, "orca: T, look-ahead; bvc: the cell ends at horizon * v_max", unit="s", minimum=0.05, maximum=60
-    )
-    softness: float = setting(30.0, "orca: rho, weight of a violated half-plane", unit="1", minimum=0.01, maximum=1e6)
-    bias: float = setting(0.2, "orca: beta, share by which all keep to the right", unit="1", minimum=-1, maximum=1)
-    period: float = setting(0.2, "orca: T_s, time in which an overlap is resolved", unit="s", minimum=0.001, maximum=10)
-    influence: float = setting(1.31, "potential: r_inf, range of the field", unit="m", minimum=0.03, maximum=100)
-    strength: float = setting(0.33, "potential: k, strength of the field", unit="m^2/s", minimum=0, maximum=100)
-    core: float = setting(0.1, "potential: d_c, distance of infinite repulsion", unit="m", minimum=0, maximum=100)
-    tangential: float = setting(
-        0.3, "potential: c_t, share of the force that acts sideways", unit="1", minimum=-2, maximum=2
-    )
-    margin_rate: float = setting(0.0, "growth of a safety margin with age", unit="m/s", minimum=0, maximum=10)
-    margin_max: float = setting(0.3, "largest such margin", unit="m", minimum=0, maximum=10)
-    sidestep: float = setting(
-        0.25, "bvc: closer to the wall than this, step to the right", unit="m", minimum=1e-6, maximum=10
-    )
-    stretch_z: float = setting(
-        1.0, "bvc: height of an agent over its width (downwash)", unit="1", minimum=0.1, maximum=20
-    )
+    v_max: float = setting(1.5, "largest commanded speed", "m/s", 0.01, 20)
+    gain: float = setting(2.0, "K_P: speed towards the goal per distance to it", "1/s", 0.01, 100)
+    radius: float = setting(0.336, "orca: R_c, of a pair; bvc: of one agent", "m", 0.01, 10)
+    horizon: float = setting(1.0, "orca: T, look-ahead; bvc: the cell ends at horizon * v_max", "s", 0.05, 60)
+    softness: float = setting(30.0, "orca: rho, weight of a violated half-plane", "1", 0.01, 1e6)
+    bias: float = setting(0.2, "orca: beta, share by which all keep to the right", "1", -1, 1)
+    period: float = setting(0.2, "orca: T_s, time in which an overlap is resolved", "s", 0.001, 10)
+    influence: float = setting(1.31, "potential: r_inf, range of the field", "m", 0.03, 100)
+    strength: float = setting(0.33, "potential: k, strength of the field", "m^2/s", 0, 100)
+    core: float = setting(0.1, "potential: d_c, distance of infinite repulsion", "m", 0, 100)
+    tangential: float = setting(0.3, "potential: c_t, share of the force that acts sideways", "1", -2, 2)
+    margin_rate: float = setting(0.0, "growth of a safety margin with age", "m/s", 0, 10)
+    margin_max: float = setting(0.3, "largest such margin", "m", 0, 10)
+    sidestep: float = setting(0.25, "bvc: closer to the wall than this, step to the right", "m", 1e-6, 10)
+    stretch_z: float = setting(1.0, "bvc: height of an agent over its width (downwash)", "1", 0.1, 20)
 
     def __post_init__(self) -> None:
         check(self)
@@ -62,8 +54,8 @@ class AvoiderParams(Settings):
 class VehicleParams(Settings):
     """Point mass that follows a velocity command: a = clip((v_cmd - v) / tau, a_max)."""
 
-    tau: float = setting(0.25, "time constant of the velocity response", unit="s", minimum=0.01, maximum=10)
-    a_max: float = setting(2.0, "largest acceleration (norm)", unit="m/s^2", minimum=0.01, maximum=200)
+    tau: float = setting(0.25, "time constant of the velocity response", "s", 0.01, 10)
+    a_max: float = setting(2.0, "largest acceleration (norm)", "m/s^2", 0.01, 200)
 
     def step(self, dt: float, position: Array, velocity: Array, command: Array) -> None:
         """Move vehicles, (3,) or (3, N), on by dt s, not longer than ``tau``: position and velocity in place."""
@@ -83,12 +75,8 @@ class FlightModel(Settings):
     avoider_kind: str = setting(REQUIRED, "the avoider in the compiled kernel", choices=KINDS)
     avoider: AvoiderParams = setting(REQUIRED, "the avoider's parameters", section=AvoiderParams)
     vehicle: VehicleParams = setting(REQUIRED, "the vehicle's parameters", section=VehicleParams)
-    spacing: float = setting(
-        REQUIRED, "s: agents on the start circle are this far apart", unit="m", minimum=1e-6, maximum=1000
-    )
-    min_radius: float = setting(
-        REQUIRED, "r0: smallest start circle; R = max(r0, s N / 2 pi)", unit="m", minimum=1e-6, maximum=1000
-    )
+    spacing: float = setting(REQUIRED, "s: agents on the start circle are this far apart", "m", 1e-6, 1000)
+    min_radius: float = setting(REQUIRED, "r0: smallest start circle; R = max(r0, s N / 2 pi)", "m", 1e-6, 1000)
 
     @property
     def kind(self) -> int:
@@ -136,21 +124,13 @@ def flight_model(name: str, options: Mapping[str, float] | None = None) -> Fligh
     :raises ConfigError: for unknown names and values outside their range.
     """
     model = AVOIDERS.row(name)
-    if all("." in key for key in options or ()):  # those are plug-ins' own
+    values: dict[str, Any] = {key: value for key, value in (options or {}).items() if "." not in key}
+    if not values:
         return model
-    groups: dict[str, dict[str, Any]] = {"avoider": {}, "vehicle": {}, "room": {}}
-    owners = {spec.name: "avoider" for spec in settings_of(AvoiderParams)}
-    owners |= {spec.name: "vehicle" for spec in settings_of(VehicleParams)}
-    owners |= {"spacing": "room", "min_radius": "room"}
-    for key, value in (options or {}).items():
-        if "." in key:
-            continue
-        if key not in owners:
-            raise ConfigError(f"options.{key}", value, SETTING_NAMES + ", ".join(owners))
-        groups[owners[key]][key] = value
-    return dataclasses.replace(
-        model,
-        avoider=dataclasses.replace(model.avoider, **groups["avoider"]),
-        vehicle=dataclasses.replace(model.vehicle, **groups["vehicle"]),
-        **groups["room"],
-    )
+    of_avoider, of_vehicle = ([spec.name for spec in settings_of(cls)] for cls in (AvoiderParams, VehicleParams))
+    names = [*of_avoider, *of_vehicle, "spacing", "min_radius"]
+    if unknown := next((key for key in values if key not in names), None):
+        raise ConfigError(f"options.{unknown}", values[unknown], SETTING_NAMES + ", ".join(names))
+    avoider = dataclasses.replace(model.avoider, **{key: values.pop(key) for key in of_avoider if key in values})
+    vehicle = dataclasses.replace(model.vehicle, **{key: values.pop(key) for key in of_vehicle if key in values})
+    return dataclasses.replace(model, avoider=avoider, vehicle=vehicle, **values)

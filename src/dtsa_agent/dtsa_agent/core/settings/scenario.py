@@ -36,9 +36,7 @@ def policy_key(seed: int) -> int:
 def plug_in_random(config: SwarmConfig, agent: int, name: str) -> np.random.Generator:
     """Random numbers of one instance of a plug-in: the same in nodes, simulator and verifier.
 
-    :param config: what its factory was given; the run's seed counts.
-    :param agent: id, as its factory was given it.
-    :param name: the plug-in's name.
+    :param config, agent: what its factory was given; the run's seed counts.
     """
     return generator(config.seed, STREAM_PLUG_INS, agent, *name.encode())
 
@@ -137,10 +135,8 @@ class Scenario:
 
 
 def make_scenario(config: SwarmConfig) -> Scenario:
-    """The scenario of a configuration.
+    """The scenario of a configuration: the same arrays for the same configuration, in every process.
 
-    :param config: scenario, number of agents and movers, shape, jitter, seed.
-    :returns: the same arrays for the same configuration, in every process.
     :raises ConfigError: if it does not fit into the extent that frames can say.
     """
     random = generator(config.seed, STREAM_SCENARIO)
@@ -155,7 +151,9 @@ def make_scenario(config: SwarmConfig) -> Scenario:
     target, moving = places.copy(), np.zeros(count, dtype=np.bool_)
     if config.scenario == "streams":
         moving[: config.movers] = True
-        target[:, : config.movers] += _stream_lengths(config)
+        half, (_, _, length) = config.movers // 2, _stream_size(config)
+        target[0, :half] += length  # one stream flies along x, the other along y
+        target[1, half : config.movers] += length
     else:
         for index in chosen[: config.movers // 2]:
             a, b = pairs[index]
@@ -188,9 +186,9 @@ def check_extent(config: SwarmConfig, scenario: Scenario) -> None:
 
     :raises ConfigError: naming the extent that would do.
     """
-    points = [scenario.start, scenario.target, *([] if scenario.plan is None else scenario.plan.goals)]
-    reach = max(float(np.abs(planes).max(initial=0.0)) for planes in points)
-    if not all(np.isfinite(planes).all() for planes in points):
+    points = np.array([scenario.start, scenario.target, *([] if scenario.plan is None else scenario.plan.goals)])
+    reach = float(np.abs(points).max(initial=0.0))
+    if not np.isfinite(points).all():
         raise ConfigError("scenario", "places that are not", "finite starts and goals")
     if not reach + FIELD_MARGIN_M <= config.extent_m:
         enough = math.ceil(10.0 * (reach + FIELD_MARGIN_M)) / 10.0
@@ -247,26 +245,16 @@ def _waypoints(config: SwarmConfig, plain: Scenario, random: np.random.Generator
     return points
 
 
-def _stream_size(config: SwarmConfig) -> tuple[int, float]:
-    """Agents in a row of a stream, and the distance between them, m."""
-    half = max(1, (config.movers + 1) // 2)
-    return math.ceil(math.sqrt(half)), max(1.0, flight_model(config.avoider, config.options).spacing)
-
-
-def _stream_lengths(config: SwarmConfig) -> Array:
-    """How far each mover of two crossing streams flies, (3, movers), m: one along x, the other along y."""
-    rows, gap = _stream_size(config)
-    lengths = np.zeros((3, config.movers))
-    length = 2 * ((rows + 1) * gap + 2.0)
-    lengths[0, : config.movers // 2] = length
-    lengths[1, config.movers // 2 :] = length
-    return lengths
+def _stream_size(config: SwarmConfig) -> tuple[int, float, float]:
+    """Agents in a row of a stream, the distance between them, m, and the length of the way of each, m."""
+    rows = math.ceil(math.sqrt(max(1, (config.movers + 1) // 2)))
+    gap = max(1.0, flight_model(config.avoider, config.options).spacing)
+    return rows, gap, 2 * ((rows + 1) * gap + 2.0)
 
 
 def _streams(config: SwarmConfig) -> tuple[Array, NDArray[np.int64]]:
     """Places of two blocks that will cross, movers first, and of those that hover around them."""
-    rows, gap = _stream_size(config)
-    length = 2 * ((rows + 1) * gap + 2.0)
+    rows, gap, length = _stream_size(config)
     half, movers = config.movers // 2, config.movers
     index = np.arange(movers - half)  # the second stream has the odd one
     depth, lane = index // rows * gap, (index % rows - (rows - 1) / 2) * gap
@@ -296,15 +284,11 @@ def half_axes(config: SwarmConfig) -> tuple[float, float, float]:
 def _places(config: SwarmConfig) -> tuple[Array, NDArray[np.int64]]:
     """Places on the shape, (3, N), and the index of the place opposite to each (-1: none)."""
     count, (ax, ay, az) = config.agents, half_axes(config)
-    partner = np.full(count, -1, dtype=np.int64)
-    half = count // 2
-    if half:
-        partner[: 2 * half] = (np.arange(2 * half) + half) % (2 * half)
+    partner, half = np.full(count, -1, dtype=np.int64), count // 2
+    partner[: 2 * half] = np.roll(np.arange(2 * half), -half)
     if config.shape == "ellipsoid":
-        unit = np.empty((3, count))
-        unit[:, :half] = _half_sphere(half)
-        unit[:, half : 2 * half] = -unit[:, :half]
-        unit[:, 2 * half :] = np.array([[0.0], [0.0], [1.0]])
+        upper, top = _half_sphere(half), np.array([[0.0], [0.0], [1.0]])
+        unit = np.concatenate((upper, -upper, top), axis=1)[:, :count]
         return unit * np.array([[ax], [ay], [az]]), partner
     angle = _equal_arcs(count, ax, ay)
     return np.stack((ax * np.cos(angle), ay * np.sin(angle), np.zeros(count))), partner

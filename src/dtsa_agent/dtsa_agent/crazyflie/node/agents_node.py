@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from dtsa_msgs.msg import Slot
@@ -24,7 +23,7 @@ from std_msgs.msg import Empty
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.core.swarm import Swarm
-from dtsa_agent.crazyflie.state import Vector, rotate
+from dtsa_agent.crazyflie.state import Vector
 from dtsa_agent.keys import authenticator
 from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
@@ -33,6 +32,7 @@ from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.messages import Fields
 from dtsa_agent.ros.common.node_process import run_node
 from dtsa_agent.ros.common.parameters import check_parameters, declare_settings, swarm_wide_node
+from dtsa_agent.ros.odometry_vehicle import rotate
 from dtsa_agent.ros.realtime import RealtimeNode
 from dtsa_agent.ros.swarm_host import declare_ids, declare_swarm
 from dtsa_agent.stop import Stop
@@ -56,7 +56,7 @@ class ExternalVehicles:
 
     :param swarms: the agents, in one or several swarms; positions and velocities are written into them from outside.
     :param every: slots between two commands.
-    :param send: takes the place of a swarm and its agents' commanded velocities, m/s, frame map.
+    :param send: takes the index of a swarm and its agents' commanded velocities, m/s, frame map.
     :param fence: m, frame map, corners of the box that no command leads out of; None: there is none.
     """
 
@@ -112,23 +112,32 @@ class ExternalVehicles:
         return push * np.minimum(1.0, PUSH_M / np.maximum(np.linalg.norm(push, axis=0), SAME_PLACE_M))
 
 
-class CrazyflieAgents(RealtimeNode):
-    """Agents that begin their slots by the station's clock and whose vehicles are flown elsewhere.
+@dataclass(frozen=True, slots=True)
+class CrazyflieAgentsSettings(Settings):
+    """What the node needs beside what the whole swarm agrees on."""
 
-    :param command_hz: rate of the commands, Hz; at most one a slot.
-    :param vehicles: names of the agents' vehicles.
-    :param origin: m, where the vehicles' world sees the origin of `map`.
-    :param fence: of `ExternalVehicles`.
-    """
+    command_hz: float = setting(50.0, "rate of the commands", unit="Hz", minimum=1, maximum=100)
+    priority: int = setting(0, "real-time priority; 0: none", minimum=0, maximum=90)
+    vehicles: str = setting("", "names of the vehicles of all agents, with blanks between; empty: cf1, cf2, ...")
+    origin: Vector = setting((0.0, 0.0, 0.0), "where the vehicles' world sees the origin of map", unit="m")
+    fence: bool = setting(False, "give no command that leads out of the box between fence_min and fence_max")
+    fence_min: Vector = setting((-1.5, -2.3, -0.95), "lower corner of the box, frame map", unit="m")
+    fence_max: Vector = setting((1.5, 2.3, 0.95), "upper corner of the box, frame map", unit="m")
+
+
+class CrazyflieAgents(RealtimeNode):
+    """Agents that begin their slots by the station's clock and whose vehicles (names) are flown elsewhere."""
 
     def __init__(
-        self, node: Node, config: SwarmConfig, *args: Any, command_hz: float, vehicles: Sequence[str],
-        origin: Vector, fence: tuple[Vector, Vector] | None, **more: Any,
+        self, node: Node, config: SwarmConfig, ids: Sequence[int], space: str, settings: CrazyflieAgentsSettings,
+        vehicles: Sequence[str],
     ) -> None:  # fmt: skip
-        super().__init__(node, config, *args, **more)
-        every, swarms = max(1, round(1.0 / command_hz / config.slot_s)), [agent.swarm for agent in self.agents]
+        # One station, one clock: no offsets, and nothing to align.
+        super().__init__(node, config, ids, space, authenticator=authenticator(config), align=False)
+        every, swarms = max(1, round(1.0 / settings.command_hz / config.slot_s)), [a.swarm for a in self.agents]
+        fence = (settings.fence_min, settings.fence_max) if settings.fence else None
         self._vehicles, count = ExternalVehicles(swarms, every, self._command, fence), len(swarms)
-        self._names, self._origin = vehicles, origin
+        self._names, self._origin = vehicles, np.array(settings.origin)
         self._odometry_time = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
         self._stamp = np.zeros(count)  # s, system clock, of that
@@ -160,8 +169,9 @@ class CrazyflieAgents(RealtimeNode):
         if not self._bridges[index].admits(time.monotonic(), feed.sender):
             raise BadMessage(OTHER_SENDER, f"odometry of {self._names[index]} from two publishers")
         place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
-        x, y, z = self._origin if message.header.frame_id == WORLD else (0.0, 0.0, 0.0)
-        self._measured[:, index] = place.x - x, place.y - y, place.z - z
+        self._measured[:, index] = place.x, place.y, place.z
+        if message.header.frame_id == WORLD:
+            self._measured[:, index] -= self._origin
         self._stamp[index] = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
         # The twist of an odometry message is in the body's frame (REP-103).
         self.agents[index].swarm.velocity[:, 0] = rotate((q.x, q.y, q.z, q.w), (speed.x, speed.y, speed.z))
@@ -184,19 +194,6 @@ class CrazyflieAgents(RealtimeNode):
         self._vehicles.send_commands(self.agents[index].slot, index)
 
 
-@dataclass(frozen=True, slots=True)
-class CrazyflieAgentsSettings(Settings):
-    """What the node needs beside what the whole swarm agrees on."""
-
-    command_hz: float = setting(50.0, "rate of the commands", unit="Hz", minimum=1, maximum=100)
-    priority: int = setting(0, "real-time priority; 0: none", minimum=0, maximum=90)
-    vehicles: str = setting("", "names of the vehicles of all agents, with blanks between; empty: cf1, cf2, ...")
-    origin: Vector = setting((0.0, 0.0, 0.0), "where the vehicles' world sees the origin of map", unit="m")
-    fence: bool = setting(False, "give no command that leads out of the box between fence_min and fence_max")
-    fence_min: Vector = setting((-1.5, -2.3, -0.95), "lower corner of the box, frame map", unit="m")
-    fence_max: Vector = setting((1.5, 2.3, 0.95), "upper corner of the box, frame map", unit="m")
-
-
 def _body(stop: Stop, supervised: bool) -> None:
     plain = {"start_parameter_services": False, "enable_rosout": False} if supervised else {}
     node, space = swarm_wide_node("crazyflie_agents", plain)
@@ -209,11 +206,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         vehicles = station.vehicles.split() or [f"cf{k}" for k in range(1, config.agents + 1)]
         if len(vehicles) != config.agents:
             raise ConfigError("vehicles", station.vehicles, f"{config.agents} names")
-        # One station, one clock: no offsets, and nothing to align.
-        more = {"authenticator": authenticator(config), "align": False, "command_hz": station.command_hz}
-        more |= {"vehicles": [vehicles[k - 1] for k in ids], "origin": station.origin}
-        more["fence"] = (station.fence_min, station.fence_max) if station.fence else None
-        agents = CrazyflieAgents(node, config, ids, space, **more)
+        agents = CrazyflieAgents(node, config, ids, space, station, [vehicles[k - 1] for k in ids])
         try:
             agents.run(stop)
         finally:

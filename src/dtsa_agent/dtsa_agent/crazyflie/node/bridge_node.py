@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
@@ -24,7 +24,7 @@ from rclpy.node import Node
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import named
 from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.commands import CommandThread
+from dtsa_agent.crazyflie.commands import TopicThread
 from dtsa_agent.crazyflie.positions import PositionSettings
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.settings import load_swarm
@@ -36,7 +36,7 @@ from dtsa_agent.ros.common.parameters import check_parameters, declare_settings
 
 from .interfaces import NODE
 from .preflight import FAIL, check_preflight
-from .topics import BridgeInputs, BridgeOutputs, helper_node, subscribe_positions
+from .topics import BridgeInputs, BridgeOutputs, subscribe_positions
 
 STATUS_HZ = 5.0
 SETTLE_S = 1.2  # of a check before flight
@@ -55,14 +55,13 @@ def settings_parameters(node: Node, name: str, given: Given) -> Given:
 class BridgeNode(Node):
     """ROS side of the bridge.
 
-    :param config: the swarm's YAML; None: the node's parameter `config`.
     :raises ConfigError: the configuration is not usable, or a parameter is not known.
     """
 
-    def __init__(self, config: Path | None = None, **node_options: Any) -> None:
-        super().__init__(NODE, enable_rosout=False, **node_options)
+    def __init__(self) -> None:
+        super().__init__(NODE, enable_rosout=False)
         text = ParameterDescriptor(description="the swarm's YAML file", read_only=True)
-        given = self.declare_parameter("config", str(config or ""), text).value
+        given = self.declare_parameter("config", "", text).value
         if not given:
             raise ConfigError("config", "", "the path of a swarm's YAML file")
         settings = load_swarm(Path(given))
@@ -72,18 +71,20 @@ class BridgeNode(Node):
         station = dataclasses.replace(settings.station, safety=safety, positions=positions)
         self.settings = dataclasses.replace(settings, station=station)
         self.outputs = BridgeOutputs(self, self.settings)
-        self.bridge = Bridge(self.settings, self.log, self.outputs.publish_state)
-        self.command_thread = CommandThread(helper_node(self, "commands"))
-        self._inputs = BridgeInputs(self, self.bridge, self.command_thread, self.log)
-        self.positions = CommandThread(helper_node(self, "positions")) if positions.enabled else None
-        if self.positions is not None:
-            subscribe_positions(self.positions, positions, self.bridge.vehicles)
+        self.bridge = Bridge(self.settings, self.log, self.outputs.publish_report)
+        self._commands, self.positions = self._topic_thread("commands"), self._topic_thread("positions")
+        self._inputs = BridgeInputs(self, self.bridge, self._commands, self.log)
+        subscribe_positions(self.positions, positions, self.bridge.vehicles)
+
+    def _topic_thread(self, name: str) -> TopicThread:
+        plain = {"enable_rosout": False, "start_parameter_services": False, "use_global_arguments": False}
+        node = Node(f"{self.get_name()}_{name}", namespace=self.get_namespace(), context=self.context, **plain)
+        return TopicThread(node, name)
 
     def close(self) -> None:
         """End of what this node added to itself."""
-        self.command_thread.close()
-        if self.positions is not None:
-            self.positions.close()
+        self._commands.close()
+        self.positions.close()
         self.destroy_node()
 
     def log(self, level: str, line: str) -> None:
@@ -104,25 +105,24 @@ class BridgeNode(Node):
         :param stop: asked ten times a second; True ends the wait for the connections.
         """
         began = time.monotonic()
-        if self.positions is not None:
-            self.positions.start()
-        missing = self.bridge.connect(stop=stop)
+        self.positions.start()
+        missing = self.bridge.connect(stop)
         if stop():
             return "interrupted while connecting"
         total = len(self.bridge.vehicles)
         self.log("info", f"{total - len(missing)} of {total} connected in {time.monotonic() - began:.2f} s")
         if missing:
             self.log("warn", f"not connected: {', '.join(missing)} (service reconnect)")
-        if self.bridge.connected < self.settings.station.min_connected:
-            return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
+        if total - len(missing) < self.settings.station.min_connected:
+            return f"{total - len(missing)} connected, min_connected is {self.settings.station.min_connected}"
         if self.settings.station.on_board.enabled:
             if problem := self.bridge.start_agents():
                 return problem
             rate = self.settings.station.on_board.polls_hz
             self.log("info", f"agents started on board; from now on {rate:g} packets a second to each")
         self._inputs.offer()
-        self.create_timer(1.0 / STATUS_HZ, lambda: self.outputs.publish_status(self.bridge.snapshots()))
-        self.create_timer(1.0, lambda: self.outputs.publish_diagnostics(self.bridge.snapshots()))
+        self.create_timer(1.0 / STATUS_HZ, lambda: self.outputs.publish_status(self.bridge.vehicles))
+        self.create_timer(1.0, lambda: self.outputs.publish_diagnostics(self.bridge.vehicles))
         return ""
 
 
@@ -167,8 +167,7 @@ def run_node(node: BridgeNode) -> int:
         node.log("warn", f"no real-time priority ({problem}): keep this station free of other work")
     elif level:
         use_last_processor()
-    problem = node.start(interrupts.any)
-    if problem:
+    if problem := node.start(interrupts.any):
         node.log("error", problem)
         node.bridge.close()
         return 1
@@ -189,21 +188,19 @@ def check_node(node: BridgeNode, print_line: Callable[[str], None]) -> int:
     interrupts = _Interrupts()
     level = node.settings.station.priority
     problem = set_realtime(level) if level else ""
-    if node.positions is not None:
-        node.positions.start()
-    node.bridge.connect(stop=interrupts.any)
+    node.positions.start()
+    node.bridge.connect(interrupts.any)
     interrupts.wait(SETTLE_S)  # rates and qualities are counted over a second
-    firmware = {v.name: v.link.firmware for v in node.bridge.vehicles.values() if v.link.firmware is not None}
-    findings = check_preflight(node.settings, node.bridge.snapshots(), firmware, node.bridge.radios, problem)
+    findings = check_preflight(node.bridge, problem)
     node.bridge.close()
-    for finding in findings:
-        print_line(str(finding))
-    return int(any(finding.level == FAIL for finding in findings))
+    for item, level_text, text in findings:
+        print_line(f"{level_text:4}  {item:9}  {text}")
+    return int(any(level_text == FAIL for _, level_text, _ in findings))
 
 
 def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
     bridge = node.bridge
-    bridge.end_heartbeat()  # from here on the bridge alone brings them down
+    bridge.heartbeat = None  # from here on the bridge alone brings them down
     flying = first = bridge.names_in_air(time.monotonic())
     if flying:
         node.log("warn", f"landing {', '.join(flying)}; Ctrl-C again stops all motors")

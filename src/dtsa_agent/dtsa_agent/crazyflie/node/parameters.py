@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -12,56 +12,21 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.link import CrazyflieLink
 
-FLOATS = frozenset({"float", "FP16", "double"})
 ALL = "all"
 PARAMS = ".params."
 GROUPS = "hlCommander.groupmask"
 
 
-@dataclass(frozen=True, slots=True)
-class FirmwareParameter:
-    """One parameter of the firmware."""
-
-    name: str  # group.name
-    c_type: str  # such as uint8_t
-    read_only: bool
-    value: float  # int for integer types
-
-    def why_refused(self, value: object) -> str:
-        """Return why the parameter cannot be set to a value; empty if it can."""
-        if self.read_only:
-            return f"{self.name} is read-only"
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            return f"{self.name}: {value!r} is not a number"
-        if self.c_type in FLOATS:
-            return ""
-        bits = int("".join(filter(str.isdigit, self.c_type)))
-        low, high = (0, 2**bits - 1) if self.c_type.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-        if value != int(value) or not low <= value <= high:
-            return f"{self.name}: {value!r} is not a whole number from {low} to {high}"
-        return ""
-
-
-def read_parameters(link: CrazyflieLink) -> dict[str, FirmwareParameter]:
-    """Return the parameters of a Crazyflie that were read when it connected, by `group.name`."""
-    cf = link.crazyflie
-    if cf is None:
-        return {}
-    parameters = {}
-    for group, elements in dict(cf.param.toc.toc).items():
-        for name, element in dict(elements).items():
-            text = cf.param.values.get(group, {}).get(name)
-            if text is None:
-                continue
-            full_name = f"{group}.{name}"
-            value = link.robot.firmware_params.get(full_name)  # set after connecting: newer than cflib's copy
-            if value is None:
-                value = float(text) if element.ctype in FLOATS else int(text)
-            read_only = element.access == element.RO_ACCESS
-            parameters[full_name] = FirmwareParameter(full_name, element.ctype, read_only, value)
-    return parameters
+def why_refused(name: str, element: Any, value: object) -> str:
+    """Return why a parameter, an entry of cflib's table, cannot be set to a value; empty if it can."""
+    if element.access == element.RO_ACCESS:
+        return f"{name} is read-only"
+    try:
+        struct.pack(element.pytype, value)
+    except (struct.error, OverflowError):
+        return f"{name}: {value!r} is no {element.ctype}"
+    return "" if math.isfinite(value) else f"{name}: {value!r} is not finite"  # type: ignore[arg-type]
 
 
 class FirmwareParameters:
@@ -72,56 +37,57 @@ class FirmwareParameters:
     """
 
     def __init__(self, node: Node, bridge: Bridge, log: Callable[[str, str], None], masks: dict[str, int]) -> None:
-        self._node, self._bridge, self._log, self._masks = node, bridge, log, masks
-        self._by_robot: dict[str, dict[str, FirmwareParameter]] = {}
+        self._node, self._vehicles, self._log, self._masks = node, bridge.vehicles, log, masks
+        self._elements: dict[str, dict[str, Any]] = {}  # entries of cflib's table, by robot and `group.name`
 
     def declare(self) -> None:
         """Declare address and initial position of each robot, and the parameters of each connected Crazyflie."""
-        common: dict[str, FirmwareParameter] = {}
-        for name, vehicle in self._bridge.vehicles.items():
-            self._declare(f"robots.{name}.uri", vehicle.robot.uri, read_only=True)
-            self._declare(f"robots.{name}.initial_position", list(vehicle.robot.initial_position), read_only=True)
-            self._by_robot[name] = read_parameters(vehicle.link)
-            for parameter in self._by_robot[name].values():
-                self._declare(f"{name}{PARAMS}{parameter.name}", parameter.value, read_only=parameter.read_only)
-            common = self._by_robot[name] | common
-        for parameter in common.values():
-            self._declare(f"{ALL}{PARAMS}{parameter.name}", parameter.value, read_only=parameter.read_only)
+        common: dict[str, tuple[Any, float]] = {}
+        for robot, vehicle in self._vehicles.items():
+            self._declare(f"robots.{robot}.uri", vehicle.robot.uri, read_only=True)
+            self._declare(f"robots.{robot}.initial_position", list(vehicle.robot.initial_position), read_only=True)
+            found = vehicle.link.parameters()
+            self._elements[robot] = {name: element for name, (element, _) in found.items()}
+            self._declare_firmware(robot, found)
+            common = found | common
+        self._declare_firmware(ALL, common)
         self._node.add_on_set_parameters_callback(self._check)
         self._node.add_post_set_parameters_callback(self._apply)
+
+    def _declare_firmware(self, target: str, found: dict[str, tuple[Any, float]]) -> None:
+        for name, (element, value) in found.items():
+            self._declare(f"{target}{PARAMS}{name}", value, read_only=element.access == element.RO_ACCESS)
 
     def _declare(self, name: str, value: Any, *, read_only: bool) -> None:
         self._node.declare_parameter(name, value, ParameterDescriptor(read_only=read_only), ignore_override=True)
 
+    def _robots_with(self, target: str, name: str) -> list[str]:
+        """Return the robots of a target (a robot's name or `all`) that have a parameter."""
+        return [robot for robot, known in self._elements.items() if target in (ALL, robot) and name in known]
+
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Accept the request if every parameter can be set."""
         for parameter in parameters:
-            target, separator, name = parameter.name.partition(PARAMS)
-            for robot in self._robots_with(target, name) if separator else ():
-                problem = self._by_robot[robot][name].why_refused(parameter.value)
-                if target != ALL and not self._bridge.vehicles[robot].link.can_set:
+            target, _, name = parameter.name.partition(PARAMS)
+            for robot in self._robots_with(target, name):
+                problem = why_refused(name, self._elements[robot][name], parameter.value)
+                if target != ALL and not self._vehicles[robot].link.can_set:
                     problem = f"{robot} is not connected, or its parameters are being read"
                 if problem:
                     self._log("warn", f"parameter {parameter.name}: {problem}")
                     return SetParametersResult(successful=False, reason=problem)
         return SetParametersResult(successful=True)
 
-    def _robots_with(self, target: str, name: str) -> list[str]:
-        """Return the robots of a target (a robot's name or `all`) that have a parameter."""
-        robots = list(self._by_robot) if target == ALL else [target]
-        return [robot for robot in robots if name in self._by_robot.get(robot, {})]
-
     def _apply(self, parameters: Sequence[Parameter]) -> None:
         """Send each new value to its Crazyflie; a parameter of `all` is set for each connected robot."""
         for parameter in parameters:
-            target, separator, name = parameter.name.partition(PARAMS)
-            if not separator:
-                continue
+            target, _, name = parameter.name.partition(PARAMS)
+            robots = self._robots_with(target, name)
             if target == ALL:
-                robots = [r for r in self._robots_with(target, name) if self._bridge.vehicles[r].link.can_set]
+                robots = [robot for robot in robots if self._vehicles[robot].link.can_set]
                 self._node.set_parameters([Parameter(f"{r}{PARAMS}{name}", value=parameter.value) for r in robots])
-                continue
-            self._bridge.vehicles[target].link.set_parameter(name, parameter.value)
-            if name == GROUPS:
-                self._masks[target] = int(parameter.value)
-            self._log("info", f"parameter {parameter.name} = {parameter.value:g}")
+            elif robots:
+                self._vehicles[target].link.set_parameter(name, parameter.value)
+                if name == GROUPS:
+                    self._masks[target] = int(parameter.value)
+                self._log("info", f"parameter {parameter.name} = {parameter.value:g}")

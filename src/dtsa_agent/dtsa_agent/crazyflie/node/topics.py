@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -26,11 +26,11 @@ from std_srvs.srv import Empty, SetBool, Trigger
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.commands import FULL_STATE, POSITION, VELOCITY_WORLD, CommandInput, CommandThread
-from dtsa_agent.crazyflie.positions import NAMED_POSES, PoseTracker, PositionSettings
+from dtsa_agent.crazyflie.commands import FULL_STATE, POSITION, VELOCITY_WORLD, TopicThread, check_setpoint, of_message
+from dtsa_agent.crazyflie.positions import NAMED_POSES, PoseTracker, PositionSettings, quantile
 from dtsa_agent.crazyflie.settings import SwarmSettings
-from dtsa_agent.crazyflie.state import State, VehicleState, place_text, rotate_inverse
-from dtsa_agent.crazyflie.vehicle import OFF, CrazyflieVehicle, Snapshot
+from dtsa_agent.crazyflie.state import OFF, State, VehicleState, place_text, rotate_inverse
+from dtsa_agent.crazyflie.vehicle import CrazyflieVehicle
 from dtsa_agent.ros.common.cdr import UNKNOWN, diagonal
 
 from . import interfaces
@@ -38,17 +38,18 @@ from .interfaces import EVENTS, EVENTS_QOS, STATE, TRAJECTORIES
 from .parameters import FirmwareParameters
 
 FRAME = "world"
-LATEST_ONLY = QoSProfile(depth=1)
+LATEST_ONLY, QUEUE = QoSProfile(depth=1), QoSProfile(depth=10)
 # Takes reliable publishers and others; a pose that is late is worth nothing.
 SENSOR = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LEVELS = {"info": 20, "warn": 30, "error": 40}
 ARMED_S, ARMED_POLL_S = 3.0, 0.02  # longest wait for motors that are to run, or to be locked
 LOW_POWER = 3  # pm_state
+MAX_CLOCK_S = 0.1  # a sender's clock that is wrong makes a command at most so much older
 # The firmware logs no variances: standard deviations of 3 cm, 0.1 rad and 0.1 m/s are cautious for its estimator with a
 # positioning system. Body rates are not logged.
 POSE_COVARIANCE = diagonal(0.03**2, 0.1**2)
 TWIST_COVARIANCE = diagonal(0.1**2, UNKNOWN)
-LogLine = Callable[[str, str], None]
+Order = Callable[[CrazyflieVehicle, Any], str | None]  # of a request to a vehicle; why not, if it is refused
 
 
 def seconds(duration: DurationMsg) -> float:
@@ -65,10 +66,13 @@ def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def helper_node(node: Node, name: str) -> Node:
-    """Make a node beside another one, with a longer name, whose topics are read by a thread of their own."""
-    plain = {"enable_rosout": False, "start_parameter_services": False, "use_global_arguments": False}
-    return Node(f"{node.get_name()}_{name}", namespace=node.get_namespace(), context=node.context, **plain)
+def _go_to(vehicle: CrazyflieVehicle, request: Any) -> str:
+    goal = request.goal.x, request.goal.y, request.goal.z
+    return vehicle.go_to(goal, request.yaw, seconds(request.duration), request.relative)
+
+
+def _notify(vehicle: CrazyflieVehicle, request: Any) -> str:
+    return vehicle.notify_setpoints_stop(request.remain_valid_millisecs)
 
 
 # -- what comes in ----------------------------------------------------------------------------------------------------
@@ -78,7 +82,7 @@ class BridgeInputs:
     :param commands: reads the streamed commands; not started yet.
     """
 
-    def __init__(self, node: Node, bridge: Bridge, commands: CommandThread, log: LogLine) -> None:
+    def __init__(self, node: Node, bridge: Bridge, commands: TopicThread, log: Callable[[str, str], None]) -> None:
         self._node, self._bridge, self._commands, self._log = node, bridge, commands, log
         self._on_board = bridge.settings.station.on_board.enabled
         self._waiting = ReentrantCallbackGroup()  # of services that wait: the others are served meanwhile
@@ -91,87 +95,73 @@ class BridgeInputs:
             (interfaces.Position, "cmd_position", POSITION),
             (interfaces.VelocityWorld, "cmd_velocity_world", VELOCITY_WORLD),
         )
-        warn = partial(self._node.get_logger().warning, throttle_duration_sec=1.0)
         FirmwareParameters(self._node, self._bridge, self._log, self._masks).declare()
         for name, vehicle in self._bridge.vehicles.items():
             for message, topic, kind in () if self._on_board else streams:  # agents on board steer themselves
-                read = CommandInput(kind, vehicle.controls, vehicle.station, name, warn)
-                self._commands.subscribe(message, f"{name}/{topic}", read, LATEST_ONLY)
+                self._commands.subscribe(message, f"{name}/{topic}", partial(self._stream, kind, vehicle), LATEST_ONLY)
             self._create_services(name, [name])
             self._node.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
         self._commands.start()
-        self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.note_heartbeat(), LATEST_ONLY)
+        self._node.create_subscription(EmptyMsg, "all/heartbeat", self._note_heartbeat, LATEST_ONLY)
         self._node.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
         self._create_services("all", list(self._bridge.vehicles))
 
     def _create_services(self, prefix: str, names: list[str]) -> None:
-        for kind, service, callback in self._services():
-            name, group = f"{prefix}/{service}", self._waiting if service == "arm" else None
-            order = partial(self._ordered, name, partial(callback, names))
-            self._node.create_service(kind, name, order, callback_group=group)
-
-    def _services(self) -> list[tuple[Any, str, Callable[[list[str], Any], Any]]]:
-        """Type, name and callback of each service that takes an order to one or all; `emergency` is the last."""
-        enable = [(SetBool, "enable", self._enable)] if self._on_board else []
-        return [
+        """Create the services that take an order to one or all; `emergency` is the last."""
+        enable = [(SetBool, "enable", lambda v, r: v.enable(r.data))] if self._on_board else []
+        services: list[tuple[Any, str, Order | None]] = [
             *enable,
-            *((kind, name, self._refuse) for kind, name in TRAJECTORIES),
-            (interfaces.Takeoff, "takeoff", self._takeoff),
-            (interfaces.Land, "land", self._land),
-            (interfaces.GoTo, "go_to", self._go_to),
-            (interfaces.Arm, "arm", self._arm),
-            (interfaces.NotifySetpointsStop, "notify_setpoints_stop", self._notify),
-            (Empty, "emergency", self._emergency),
+            *((kind, name, None) for kind, name in TRAJECTORIES),
+            (interfaces.Takeoff, "takeoff", lambda v, r: v.takeoff(r.height, seconds(r.duration))),
+            (interfaces.Land, "land", lambda v, r: v.land("service", r.height, seconds(r.duration))),
+            (interfaces.GoTo, "go_to", _go_to),
+            (interfaces.Arm, "arm", lambda v, r: v.arm(r.arm)),
+            (interfaces.NotifySetpointsStop, "notify_setpoints_stop", _notify),
+            (Empty, "emergency", lambda v, r: v.stop("service emergency")),
         ]
+        for kind, service, order in services:
+            group = self._waiting if service == "arm" else None
+            callback = partial(self._serve, prefix, names, service, order)
+            self._node.create_service(kind, f"{prefix}/{service}", callback, callback_group=group)
 
-    async def _ordered(self, name: str, callback: Callable[[Any], Any], request: Any, response: Any) -> Any:
+    async def _serve(
+        self, prefix: str, names: list[str], service: str, order: Order | None, request: Any, response: Any
+    ) -> Any:
         """Carry out an order, and say so: what an operator did belongs to what happened."""
         try:
-            result = callback(request)
-            done, text = await result if hasattr(result, "__await__") else result
+            done, text = self._carry_out(names, service, order, request)
+            if service == "arm":
+                done, text = await self._wait_armed(names, request.arm, done, text)
         except Exception as error:  # of this order: emergency stops must still be answered
             done, text = False, f"{type(error).__name__}: {error}"
         fields = ", ".join(f"{key} {_short(getattr(request, key))}" for key in request.get_fields_and_field_types())
-        self._log("info" if done else "warn", f"order /{name} ({fields}): {'done' if done else text}")
+        self._log("info" if done else "warn", f"order /{prefix}/{service} ({fields}): {'done' if done else text}")
         if hasattr(response, "success"):
             response.success, response.message = done, text
         return response
 
-    def _each(
-        self, names: list[str], order: Callable[[CrazyflieVehicle], str | None], group: int = 0
-    ) -> tuple[bool, str]:
-        """Give an order to those that are addressed (group 0: to all of them; else to those in one of these groups)."""
+    def _carry_out(self, names: list[str], service: str, order: Order | None, request: Any) -> tuple[bool, str]:
+        """Give an order to those that are addressed: all in group 0, else those in one of these groups."""
+        group = getattr(request, "group_mask", 0)
         members = [name for name in names if not group or self._masks[name] & group]
+        if order is None:
+            return False, "trajectories are not supported: send positions, velocities or go_to"
+        if service == "emergency":
+            for name in names:
+                order(self._bridge.vehicles[name], request)
+            self._log("error", f"EMERGENCY STOP of {', '.join(names)}: service")
+            return True, ""
         if not members:
             return False, f"none of {', '.join(names)} is in a group of {group}"
-        return self._bridge.order_each(members, order)
-
-    def _refuse(self, names: list[str], request: Any) -> tuple[bool, str]:
-        return False, "trajectories are not supported: send positions, velocities or go_to"
-
-    def _takeoff(self, names: list[str], request: Any) -> tuple[bool, str]:
-        if problem := self._bridge.why_no_takeoff():
+        if service == "takeoff" and (problem := self._bridge.why_no_takeoff()):
             return False, problem
-        duration = seconds(request.duration)
-        return self._each(names, lambda v: v.takeoff(request.height, duration), request.group_mask)
-
-    def _land(self, names: list[str], request: Any) -> tuple[bool, str]:
-        duration, notes = seconds(request.duration), list[str]()
-        order = lambda v: v.land("service", request.height, duration, notes.append)  # noqa: E731
-        done, text = self._each(names, order, request.group_mask)
-        return done, "; ".join(filter(None, (text, *notes)))
-
-    def _go_to(self, names: list[str], request: Any) -> tuple[bool, str]:
-        members = [name for name in names if not request.group_mask or self._masks[name] & request.group_mask]
-        if len(members) > 1 and not request.relative:
+        if service == "go_to" and len(members) > 1 and not request.relative:
             return False, "a go_to of all must be relative: they would meet in one place"
-        goal, duration = (request.goal.x, request.goal.y, request.goal.z), seconds(request.duration)
-        return self._each(names, lambda v: v.go_to(goal, request.yaw, duration, request.relative), request.group_mask)
+        return self._bridge.order_each(members, lambda vehicle: order(vehicle, request))
 
-    async def _arm(self, names: list[str], request: Any) -> tuple[bool, str]:
-        """Arm, or lock the motors, and wait until it is so; the executor serves others meanwhile."""
-        done, text = self._each(names, lambda v: v.arm(request.arm))
-        wanted, before = (State.ARMED, State.READY) if request.arm else (State.READY, State.ARMED)
+    async def _wait_armed(self, names: list[str], arm: bool, done: bool, text: str) -> tuple[bool, str]:
+        """Wait until motors may run, or are locked; the executor serves others meanwhile."""
+        wanted, before = (State.ARMED, State.READY) if arm else (State.READY, State.ARMED)
         end, future = time.monotonic() + ARMED_S, Future()
 
         def waits_for() -> list[str]:
@@ -190,27 +180,32 @@ class BridgeInputs:
             text = "; ".join(filter(None, (text, f"{', '.join(late)}: not {wanted.name.lower()}")))
         return done and not late, text
 
-    def _enable(self, names: list[str], request: Any) -> tuple[bool, str]:
-        return self._each(names, lambda v: v.enable(request.data))
-
-    def _notify(self, names: list[str], request: Any) -> tuple[bool, str]:
-        valid_ms = request.remain_valid_millisecs
-        return self._each(names, lambda v: v.notify_setpoints_stop(valid_ms), request.group_mask)
-
-    def _emergency(self, names: list[str], request: Any) -> tuple[bool, str]:
-        for name in names:
-            self._bridge.vehicles[name].stop("service emergency")
-        self._log("error", f"EMERGENCY STOP of {', '.join(names)}: service")
-        return True, ""
+    def _stream(self, kind: str, vehicle: CrazyflieVehicle, message: Any, published: float) -> None:
+        """Give a message, published at a Unix time (s), to its vehicle, and say why it does not count."""
+        station = vehicle.station
+        origin = station.room_origin_in_world
+        stamp = time.monotonic() - min(max(time.time() - published, 0.0), MAX_CLOCK_S)  # as old as its publication
+        try:
+            setpoint = of_message(kind, message, origin, stamp)
+            check_setpoint(setpoint, station.safety, origin, station.max_stream_mps)
+        except ValueError as error:
+            vehicle.refused, problem = vehicle.refused + 1, str(error)
+        else:
+            reason = f"{vehicle.state.name.lower()}: {vehicle.machine.reason}"
+            problem = "" if vehicle.command(setpoint) else f"commands are not accepted now ({reason})"
+        if problem:
+            self._node.get_logger().warning(f"{vehicle.name}: {problem}", throttle_duration_sec=1.0)
 
     def _reconnect(self, name: str, request: Any, response: Any) -> Any:
         problem = self._bridge.reconnect(name)
         response.success, response.message = not problem, problem or "connecting"
         return response
 
+    def _note_heartbeat(self, message: Any) -> None:
+        self._bridge.heartbeat = time.monotonic()
+
     def _end_heartbeat(self, request: Any, response: Any) -> Any:
-        self._bridge.end_heartbeat()
-        response.success = True
+        self._bridge.heartbeat, response.success = None, True
         return response
 
 
@@ -220,175 +215,169 @@ def named_pose_array() -> Any:
     try:
         from motion_capture_tracking_interfaces.msg import NamedPoseArray
     except ImportError:
-        raise ConfigError(
-            "station.positions.source", NAMED_POSES,
-            "pose, or named_poses with the package motion_capture_tracking_interfaces in the workspace (it is not)",
-        ) from None  # fmt: skip
+        allowed = "pose, or named_poses with motion_capture_tracking_interfaces in the workspace (it is not there)"
+        raise ConfigError("station.positions.source", NAMED_POSES, allowed) from None
     return NamedPoseArray
 
 
-def subscribe_positions(
-    poses: CommandThread, settings: PositionSettings, vehicles: dict[str, CrazyflieVehicle]
-) -> None:
+def subscribe_positions(poses: TopicThread, settings: PositionSettings, vehicles: dict[str, CrazyflieVehicle]) -> None:
     """Listen to motion capture, if there is one, in a thread that is not started yet.
 
     :raises ConfigError: the type of the named poses is not there.
     """
     if settings.source == NAMED_POSES:
         for topic in sorted({settings.topic_of(name) for name in vehicles}):
-            poses.subscribe(named_pose_array(), topic, partial(_named, vehicles), SENSOR)
+            poses.subscribe(named_pose_array(), topic, partial(_receive_named, vehicles), SENSOR)
     elif settings.enabled:
         for name, vehicle in vehicles.items():
-            take = lambda message, info, vehicle=vehicle: _see(vehicle, message.header, message.pose)  # noqa: E731
-            poses.subscribe(PoseStamped, settings.topic_of(name), take, SENSOR)
+            receive = lambda message, _, vehicle=vehicle: _receive(vehicle, message.header, message.pose)  # noqa: E731
+            poses.subscribe(PoseStamped, settings.topic_of(name), receive, SENSOR)
 
 
-def _named(vehicles: dict[str, CrazyflieVehicle], message: Any, info: Any) -> None:
+def _receive_named(vehicles: dict[str, CrazyflieVehicle], message: Any, _: float) -> None:
     for named in message.poses:
         if (vehicle := vehicles.get(named.name)) is not None:
-            _see(vehicle, message.header, named.pose)
+            _receive(vehicle, message.header, named.pose)
 
 
-def _see(vehicle: CrazyflieVehicle, header: Any, pose: Any) -> None:
+def _receive(vehicle: CrazyflieVehicle, header: Any, pose: Any) -> None:
     p, q = pose.position, pose.orientation
     stamp = header.stamp.sec + header.stamp.nanosec * 1e-9
     vehicle.receive_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), header.frame_id, stamp)
 
 
 # -- what goes out ----------------------------------------------------------------------------------------------------
-class BridgeOutputs:
-    """Odometry, pose, status, diagnostics and events."""
+class VehicleOutputs:
+    """Odometry, pose and status of one vehicle.
 
-    def __init__(self, node: Node, settings: SwarmSettings) -> None:
-        self._clock, self._name = node.get_clock(), node.get_name()
-        self._reported: dict[str, State] = {}  # the last state that was not left to the regular status
-        self._odom: dict[str, Any] = {}
-        self._pose: dict[str, Any] = {}
-        self._state: dict[str, Any] = {}
-        self._status: dict[str, Any] = {}  # Crazyswarm2's, beside ours
-        self._odom_message: dict[str, Odometry] = {}
-        self._wanted: dict[str, tuple[bool, bool]] = {}  # odometry, pose: is there a subscriber?
-        self._counted: dict[str, tuple[int, int]] = {}
-        self._critical = {robot.name: robot.battery.voltage_critical for robot in settings.robots}
-        positions = settings.station.positions
-        for robot in settings.robots:
-            name = robot.name
-            self._odom[name] = node.create_publisher(Odometry, f"{name}/odom", LATEST_ONLY)
-            if not positions.enabled or positions.topic_of(name).lstrip("/") != f"{name}/pose":  # motion capture's own
-                self._pose[name] = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
-            self._state[name] = node.create_publisher(StateMessage, f"{name}/{STATE}", QoSProfile(depth=10))
-            if STATE != "status":
-                kind = interfaces.Status
-                self._status[name] = node.create_publisher(kind, f"{name}/status", QoSProfile(depth=10))
-        self._events = node.create_publisher(Log, EVENTS.lstrip("/"), EVENTS_QOS)
-        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+    :param pose: whether it has a topic of poses; motion capture's own may have its name.
+    """
 
-    def publish_state(self, vehicle: CrazyflieVehicle, state: VehicleState) -> None:
+    def __init__(self, node: Node, name: str, pose: bool) -> None:
+        self._clock = node.get_clock()
+        self._odom = node.create_publisher(Odometry, f"{name}/odom", LATEST_ONLY)
+        self._pose = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY) if pose else None
+        self._state = node.create_publisher(StateMessage, f"{name}/{STATE}", QUEUE)
+        ours = STATE == "status"  # Crazyswarm2's status is published beside ours
+        self._status = None if ours else node.create_publisher(interfaces.Status, f"{name}/status", QUEUE)
+        self._reported: State | None = None  # the last state that was not left to the regular status
+        self._odom_wanted = self._pose_wanted = False  # is there a subscriber?
+        self._counted = 0, 0  # packets sent and received up to the last status
+        self._message = Odometry(child_frame_id=f"{name}/base_link")
+        self._message.header.frame_id = FRAME
+        self._message.pose.covariance, self._message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
+
+    def publish_report(self, vehicle: CrazyflieVehicle, report: VehicleState) -> None:
         """Odometry and pose of one log packet, in the link's thread, if there are subscribers.
 
         A new state is published at once: other vehicles may fly towards it.
         """
-        name = vehicle.name
-        if vehicle.state != self._reported.get(name):
-            self._reported[name] = vehicle.state
-            message = state_message(vehicle.snapshot(time.monotonic()), self._clock.now().to_msg())
-            self._state[name].publish(message)
-        odom, pose = self._wanted.get(name, (False, False))
-        if not (odom or pose):
+        stamp, message = self._clock.now().to_msg(), self._message
+        if vehicle.state != self._reported:
+            self._reported = vehicle.state
+            self._state.publish(state_message(vehicle, stamp))
+        if not (self._odom_wanted or self._pose_wanted):
             return
-        message = self._odom_message.get(name)
-        if message is None:
-            message = self._odom_message[name] = Odometry(child_frame_id=f"{name}/base_link")
-            message.header.frame_id = FRAME
-            message.pose.covariance, message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
-        message.header.stamp = self._clock.now().to_msg()
+        message.header.stamp = stamp
         p, q = message.pose.pose.position, message.pose.pose.orientation
-        p.x, p.y, p.z = state.position
-        q.x, q.y, q.z, q.w = state.orientation
-        if odom:
+        p.x, p.y, p.z = report.position
+        q.x, q.y, q.z, q.w = report.orientation
+        if self._odom_wanted:
             v = message.twist.twist.linear  # REP-103: the twist of an odometry is in the child's frame
-            v.x, v.y, v.z = rotate_inverse(state.orientation, state.velocity)
-            self._odom[name].publish(message)
-        if pose:
-            self._pose[name].publish(PoseStamped(header=message.header, pose=message.pose.pose))
+            v.x, v.y, v.z = rotate_inverse(report.orientation, report.velocity)
+            self._odom.publish(message)
+        if self._pose_wanted and self._pose is not None:
+            self._pose.publish(PoseStamped(header=message.header, pose=message.pose.pose))
+
+    def publish_status(self, vehicle: CrazyflieVehicle) -> None:
+        """Publish the status; also count the subscribers of odometry and pose."""
+        self._odom_wanted = self._odom.get_subscription_count() > 0
+        self._pose_wanted = self._pose is not None and self._pose.get_subscription_count() > 0
+        message = state_message(vehicle, self._clock.now().to_msg())
+        self._state.publish(message)
+        if self._status is not None:
+            self._status.publish(self._status_message(vehicle, message))
+
+    def _status_message(self, vehicle: CrazyflieVehicle, ours: StateMessage) -> Any:
+        """Crazyswarm2's status; the packets are those since the one before."""
+        (sent, received), critical = self._counted, vehicle.robot.battery.voltage_critical
+        self._counted = ours.num_tx_unicast, ours.num_rx_unicast
+        return interfaces.Status(
+            header=ours.header, supervisor_info=ours.supervisor_info, battery_voltage=ours.battery_voltage,
+            rssi=ours.rssi, pm_state=LOW_POWER if 0.0 < ours.battery_voltage < critical else 0,
+            num_tx_unicast=ours.num_tx_unicast - sent, num_rx_unicast=ours.num_rx_unicast - received,
+            latency_unicast=min(round(ours.latency_ms), 0xFFFF),
+        )  # fmt: skip
+
+
+class BridgeOutputs:
+    """Odometry, pose and status of all, diagnostics and events."""
+
+    def __init__(self, node: Node, settings: SwarmSettings) -> None:
+        self._clock, self._name, positions = node.get_clock(), node.get_name(), settings.station.positions
+        names = [robot.name for robot in settings.robots]
+        captured = {positions.topic_of(name).lstrip("/") for name in names} if positions.enabled else set()
+        self._vehicles = {name: VehicleOutputs(node, name, f"{name}/pose" not in captured) for name in names}
+        self._events = node.create_publisher(Log, EVENTS.lstrip("/"), EVENTS_QOS)
+        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QUEUE)
+
+    def publish_report(self, vehicle: CrazyflieVehicle, report: VehicleState) -> None:
+        """Publish what a log packet says."""
+        self._vehicles[vehicle.name].publish_report(vehicle, report)
 
     def publish_event(self, level: str, line: str) -> None:
         """Publish one line of the log, for a mission's record."""
-        stamp = self._clock.now().to_msg()
-        self._events.publish(Log(stamp=stamp, level=LEVELS.get(level, 20), name=self._name, msg=line))
+        self._events.publish(Log(stamp=self._clock.now().to_msg(), level=LEVELS[level], name=self._name, msg=line))
 
-    def publish_status(self, snapshots: Sequence[Snapshot]) -> None:
-        """Publish the status of all; also count the subscribers of odometry and pose."""
-        stamp = self._clock.now().to_msg()
-        for s in snapshots:
-            self._wanted[s.name] = (
-                self._odom[s.name].get_subscription_count() > 0,
-                s.name in self._pose and self._pose[s.name].get_subscription_count() > 0,
-            )
-            self._state[s.name].publish(state_message(s, stamp))
-            if s.name in self._status:
-                self._status[s.name].publish(self._status_message(s, stamp))
+    def publish_status(self, vehicles: dict[str, CrazyflieVehicle]) -> None:
+        """Publish the status of all."""
+        for name, vehicle in vehicles.items():
+            self._vehicles[name].publish_status(vehicle)
 
-    def _status_message(self, s: Snapshot, stamp: Any) -> Any:
-        """Crazyswarm2's status; the packets are those since the one before."""
-        sent, received = self._counted.get(s.name, (0, 0))
-        self._counted[s.name] = s.sent, s.received
-        volts = s.vehicle.battery if s.vehicle else 0.0
-        message = interfaces.Status(
-            supervisor_info=s.vehicle.info & 0xFFFF if s.vehicle else 0, battery_voltage=volts, rssi=s.rssi,
-            pm_state=LOW_POWER if s.vehicle and volts < self._critical[s.name] else 0,
-            num_tx_unicast=s.sent - sent, num_rx_unicast=s.received - received,
-            latency_unicast=min(round(s.latency_p99 * 1000), 0xFFFF),
-        )  # fmt: skip
-        message.header.stamp, message.header.frame_id = stamp, FRAME
-        return message
-
-    def publish_diagnostics(self, snapshots: Sequence[Snapshot]) -> None:
-        """Diagnostics of all."""
-        message = DiagnosticArray()
+    def publish_diagnostics(self, vehicles: dict[str, CrazyflieVehicle]) -> None:
+        """Publish diagnostics of all."""
+        message = DiagnosticArray(status=[diagnostic(vehicle, time.monotonic()) for vehicle in vehicles.values()])
         message.header.stamp = self._clock.now().to_msg()
-        message.status = [diagnostic(s, time.monotonic()) for s in snapshots]
         self._diagnostics.publish(message)
 
 
-def state_message(s: Snapshot, stamp: Any) -> StateMessage:
-    """Return a vehicle's state on the wire."""
+def state_message(vehicle: CrazyflieVehicle, stamp: Any) -> StateMessage:
+    """Return a vehicle's state on the wire; ages of what never came are -1."""
+    now, last, link = time.monotonic(), vehicle.last, vehicle.link
+    log_age, command_age = (a if math.isfinite(a) else -1.0 for a in (vehicle.log_age(now), vehicle.command_age(now)))
     message = StateMessage(
-        supervisor_info=s.vehicle.info & 0xFFFF if s.vehicle else 0,
-        battery_voltage=s.vehicle.battery if s.vehicle else 0.0, rssi=s.rssi, link_quality=s.link_quality,
-        num_tx_unicast=s.sent, num_rx_unicast=s.received, latency_ms=s.latency_p99 * 1000,
-        log_age=s.log_age if math.isfinite(s.log_age) else -1.0,
-        command_age=s.command_age if math.isfinite(s.command_age) else -1.0,
-        state=int(s.state), state_name=s.state.name.lower(), reason=s.reason,
+        supervisor_info=last.info & 0xFFFF if last else 0, battery_voltage=last.battery if last else 0.0,
+        rssi=getattr(link.driver, "rssi", 0), link_quality=vehicle.link_quality(now), num_tx_unicast=link.sent,
+        num_rx_unicast=link.received, latency_ms=vehicle.command_rate(now)[1] * 1000, log_age=log_age,
+        command_age=command_age, state=int(vehicle.state), state_name=vehicle.state.name.lower(), reason=vehicle.action,
     )  # fmt: skip
     message.header.stamp, message.header.frame_id = stamp, FRAME
     return message
 
 
-def diagnostic(s: Snapshot, now: float) -> DiagnosticStatus:
+def diagnostic(vehicle: CrazyflieVehicle, now: float) -> DiagnosticStatus:
     """Return a vehicle's line in /diagnostics."""
-    level = DiagnosticStatus.OK
-    if s.state in (State.EMERGENCY, State.LOST):
+    level, state, reason = DiagnosticStatus.OK, vehicle.state, vehicle.action
+    silent = vehicle.tracker is not None and vehicle.tracker.rate_hz(now) == 0.0
+    if state in (State.EMERGENCY, State.LOST):
         level = DiagnosticStatus.ERROR
-    elif s.state in OFF or s.reason.startswith(("battery", "hold", "land:")):
+    elif state in OFF or reason.startswith(("battery", "hold", "land:")) or silent:
         level = DiagnosticStatus.WARN
+    rate, latency = vehicle.command_rate(now)
     values = {
-        "battery [V]": f"{s.vehicle.battery:.2f}" if s.vehicle else "unknown",
-        "link quality": f"{s.link_quality:.2f}",
-        "log age [s]": f"{s.log_age:.2f}",
-        "last command age [s]": f"{s.command_age:.2f}",
-        "commands [Hz]": f"{s.command_hz:.0f}",
-        "command latency, 99th percentile [ms]": f"{s.latency_p99 * 1000:.1f}",
-        "commands refused": str(s.refused),
-        "reason": s.reason,
-    }
-    if s.tracker is not None:
-        values |= position_values(s.tracker, now)
-        if level == DiagnosticStatus.OK and s.tracker.rate_hz(now) == 0.0:
-            level = DiagnosticStatus.WARN
-    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-    name = f"crazyflie_bridge: {s.name}"
-    return DiagnosticStatus(level=level, name=name, message=s.state.name.lower(), hardware_id=s.name, values=pairs)
+        "battery [V]": f"{vehicle.last.battery:.2f}" if vehicle.last else "unknown",
+        "link quality": f"{vehicle.link_quality(now):.2f}",
+        "log age [s]": f"{vehicle.log_age(now):.2f}",
+        "last command age [s]": f"{vehicle.command_age(now):.2f}",
+        "commands [Hz]": f"{rate:.0f}",
+        "command latency, 99th percentile [ms]": f"{latency * 1000:.1f}",
+        "commands refused": str(vehicle.refused),
+        "reason": reason,
+    } | (position_values(vehicle.tracker, now) if vehicle.tracker is not None else {})  # fmt: skip
+    return DiagnosticStatus(
+        level=level, name=f"crazyflie_bridge: {vehicle.name}", message=state.name.lower(), hardware_id=vehicle.name,
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )  # fmt: skip
 
 
 def position_values(tracker: PoseTracker, now: float) -> dict[str, str]:
@@ -398,8 +387,8 @@ def position_values(tracker: PoseTracker, now: float) -> dict[str, str]:
         "positions [Hz]": f"{tracker.rate_hz(now):.0f}",
         "positions sent": str(tracker.sent),
         "position age [s]": f"{tracker.age(now):.2f}",
-        "position latency, median [ms]": f"{tracker.latency_quantile(0.5) * 1000:.1f}",
-        "position latency, 99th percentile [ms]": f"{tracker.latency_quantile(0.99) * 1000:.1f}",
+        "position latency, median [ms]": f"{quantile(tracker.latencies, 0.5) * 1000:.1f}",
+        "position latency, 99th percentile [ms]": f"{quantile(tracker.latencies, 0.99) * 1000:.1f}",
         "positions refused": refused or "0",
         "last refusal": tracker.reason,
     }

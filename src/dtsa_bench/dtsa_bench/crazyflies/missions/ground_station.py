@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,8 @@ from std_msgs.msg import Empty as EmptyMessage
 from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.crazyflie.controls import shortest_s
 from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS, STATE, STOP_HERE, Arm, GoTo, Land, Takeoff
+from dtsa_agent.crazyflie.orders import shortest_s
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.crazyflie.state import to_map, to_world
 from dtsa_agent.ros.common.loop import ExecutorThread
@@ -41,23 +42,28 @@ AGENTS_S = 60.0  # s, for their process
 
 
 class GroundStation:
-    """The ground station's part: it calls the bridge's services, watches the vehicles, and sends its heartbeat."""
+    """The ground station's part: it calls the bridge's services, watches the vehicles, and sends its heartbeat.
+
+    :param check_bridge: raises an error when the bridge's process has died; None: it is not a child of this process.
+    """
 
     def __init__(
-        self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: StopToken, report: Callable[[str], None]
-    ) -> None:
+        self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: StopToken, report: Callable[[str], None],
+        check_bridge: Callable[[], None] | None = None,
+    ) -> None:  # fmt: skip
         self.node, self.settings, self.scenario, self.ended, self.report = node, settings, scenario, ended, report
         self.status: dict[str, Status] = {}
         self.log = MissionLog()
         self.place: dict[str, tuple[float, float, float]] = {}
         self.last_status_time = time.monotonic()  # s, monotonic, the last status of anybody
         self.exchanging = False
-        self.check_bridge_process: Callable[[], None] = lambda: None
+        self.check_bridge_process = check_bridge or self._check_silence
         self._odometry: list[Any] = []
         for robot in settings.robots:
-            node.create_subscription(Status, f"/{robot.name}/{STATE}", self._keep_status(robot.name), 10)
-            subscription = node.create_subscription(Odometry, f"/{robot.name}/odom", self._keep_place(robot.name), 1)
-            self._odometry.append(subscription)
+            name = robot.name
+            node.create_subscription(Status, f"/{name}/{STATE}", partial(self._receive_status, name), 10)
+            receive = partial(self._receive_odometry, name)
+            self._odometry.append(node.create_subscription(Odometry, f"/{name}/odom", receive, 1))
         node.create_subscription(DiagnosticArray, "/diagnostics", self.log.diagnostic, 10)
         node.create_subscription(Log, EVENTS, self.log.event, EVENTS_QOS)
         self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
@@ -80,23 +86,19 @@ class GroundStation:
         }
         self._serving = ExecutorThread(node.context, "mission", node)
         self._pulse = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._serving.start()
+        self._pulse.start()
 
-    def _keep_status(self, name: str) -> Callable[[Status], None]:
-        def keep(message: Status) -> None:
-            self.status[name] = message
-            self.last_status_time = time.monotonic()
-            self.log.status(name, message)
-            if self.exchanging and message.state != Status.STATE_FLYING and not self.ended.reason:
-                self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
+    def _receive_status(self, name: str, message: Status) -> None:
+        self.status[name] = message
+        self.last_status_time = time.monotonic()
+        self.log.status(name, message)
+        if self.exchanging and message.state != Status.STATE_FLYING and not self.ended.reason:
+            self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
 
-        return keep
-
-    def _keep_place(self, name: str) -> Callable[[Odometry], None]:
-        def keep(message: Odometry) -> None:
-            p = message.pose.pose.position
-            self.place[name] = to_map((p.x, p.y, p.z), self.settings.station.room_origin_in_world)
-
-        return keep
+    def _receive_odometry(self, name: str, message: Odometry) -> None:
+        p = message.pose.pose.position
+        self.place[name] = to_map((p.x, p.y, p.z), self.settings.station.room_origin_in_world)
 
     def _beat(self) -> None:
         while not self._over.wait(0.1):
@@ -105,16 +107,10 @@ class GroundStation:
             if self._stopping is not None:
                 self._stop_here.publish(EmptyMessage())
 
-    def check_bridge(self) -> None:
-        """For a bridge that is not a child of this process; MissionError: nothing is heard of it."""
+    def _check_silence(self) -> None:
         silent = time.monotonic() - self.last_status_time
         if self.status and silent > BRIDGE_SILENT_S:
             raise MissionError(f"the bridge has been silent for {silent:.1f} s")
-
-    def start(self) -> None:
-        """Begin to listen."""
-        self._serving.start()
-        self._pulse.start()
 
     def close(self) -> None:
         """End of all threads."""
@@ -122,7 +118,7 @@ class GroundStation:
         self._serving.close()
         self._pulse.join(2.0)
 
-    def call(self, name: str, timeout: float = 10.0, **fields: Any) -> Any:
+    def call(self, name: str, timeout: float = 10.0, **fields: Any) -> None:
         """Call a service and wait for its answer (s, at most); MissionError: it does not answer or says no."""
         client = self._clients[name]
         future = client.call_async(client.srv_type.Request(**fields))
@@ -132,10 +128,8 @@ class GroundStation:
             if time.monotonic() > end:
                 raise MissionError(f"service {name} does not answer")
             time.sleep(0.005)
-        response = future.result()
-        if not getattr(response, "success", True):
-            raise MissionError(f"{name}: {response.message}")
-        return response
+        if not getattr(future.result(), "success", True):
+            raise MissionError(f"{name}: {future.result().message}")
 
     def wait(self, what: str, condition: Callable[[], bool], timeout: float) -> None:
         """Wait until something is so (s, at most); MissionError: it takes too long, or the user interrupts."""
@@ -152,23 +146,17 @@ class GroundStation:
     def _all(self, *states: int) -> bool:
         return len(self.status) == len(self.settings.robots) and all(s.state in states for s in self.status.values())
 
-    def connect(self) -> None:
-        """Wait until the bridge is up, all are ready, and it is known where each stands."""
+    def connect(self, config: SwarmConfig) -> SwarmConfig:
+        """Wait until the bridge is up and all are ready; the configuration in which all begin near where they stand.
+
+        :raises MissionError: it is not safe to begin.
+        """
         emergency = self._clients["/all/emergency"]
         self.wait("the bridge's start", emergency.service_is_ready, BRIDGE_S)
         self._beating.set()
         self.wait("the connection", self._all_ready, 10.0)
-        self.wait("odometry", lambda: len(self.place) == len(self.settings.robots), 5.0)
-
-    def _all_ready(self) -> bool:
-        locked = [f"{n} ({s.reason})" for n, s in self.status.items() if s.state == Status.STATE_EMERGENCY]
-        if locked:
-            raise MissionError(f"switch off and on before the next flight: {', '.join(locked)}")
-        return self._all(Status.STATE_READY)
-
-    def find_places(self, config: SwarmConfig) -> SwarmConfig:
-        """Return the configuration in which all begin near where they stand; MissionError: it is not safe to begin."""
         vehicles = [robot.name for robot in self.settings.robots]
+        self.wait("odometry", lambda: len(self.place) == len(vehicles), 5.0)
         measured = np.array([self.place[name] for name in vehicles]).T
         check_standing(vehicles, measured, self.settings.station.safety)
         assigned = assign_places(config, measured)
@@ -176,12 +164,14 @@ class GroundStation:
         check_crossings(self.scenario, vehicles, measured)
         return assigned
 
-    def wait_for_agents(self, alive: Callable[[], None]) -> None:
-        """Wait until the agents' process offers commands for all vehicles.
+    def _all_ready(self) -> bool:
+        locked = [f"{n} ({s.reason})" for n, s in self.status.items() if s.state == Status.STATE_EMERGENCY]
+        if locked:
+            raise MissionError(f"switch off and on before the next flight: {', '.join(locked)}")
+        return self._all(Status.STATE_READY)
 
-        :param alive: raises an error when the process has died.
-        :raises MissionError: it does not in time.
-        """
+    def wait_for_agents(self, alive: Callable[[], None]) -> None:
+        """Wait until the agents' process, which `alive` checks, offers commands for all; MissionError: not in time."""
         topics = [f"/{robot.name}/cmd_velocity_world" for robot in self.settings.robots]
 
         def offered() -> bool:
@@ -202,14 +192,13 @@ class GroundStation:
         self.call("/all/takeoff", height=height, duration=_duration(seconds))
         time.sleep(seconds)
         self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
-        starts = self.scenario.start.T.tolist()
-        way = max(math.dist(start, self.place[r.name]) for r, start in zip(self.settings.robots, starts, strict=True))
+        way = self._largest_distance_to_start()
         seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))  # for all: their ways keep apart if flown together
-        for robot, start in zip(self.settings.robots, starts, strict=True):
+        for robot, start in zip(self.settings.robots, self.scenario.start.T.tolist(), strict=True):
             x, y, z = to_world(tuple(start), self.settings.station.room_origin_in_world)
             goal = Point(x=x, y=y, z=z)
             self.call(f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
-        self.wait("the way to the start", self._at_start, seconds + 15.0)
+        self.wait("the way to the start", lambda: self._largest_distance_to_start() < ARRIVED_M, seconds + 15.0)
         time.sleep(0.5)  # the last go_to is flown to its end before streamed commands count
         # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
         self._serving.executor.create_task(self._forget_odometry)
@@ -219,12 +208,9 @@ class GroundStation:
         while self._odometry:
             self.node.destroy_subscription(self._odometry.pop())
 
-    def _at_start(self) -> bool:
-        away = [
-            np.linalg.norm(np.subtract(self.place[robot.name], start))
-            for robot, start in zip(self.settings.robots, self.scenario.start.T, strict=True)
-        ]
-        return max(away) < ARRIVED_M
+    def _largest_distance_to_start(self) -> float:
+        starts = zip(self.settings.robots, self.scenario.start.T.tolist(), strict=True)
+        return max(math.dist(self.place[robot.name], start) for robot, start in starts)
 
     @property
     def flying(self) -> list[str]:

@@ -10,7 +10,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
-import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 
@@ -27,7 +26,7 @@ from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.flights.children import Children, NodeError, describe_end
 from dtsa_bench.flights.domain import LAST_DOMAIN, ros_domain
-from dtsa_bench.flights.flight import END_S, QUIET, Flight, run_environment
+from dtsa_bench.flights.flight import END_S, QUIET, Flight, parameter_arguments, run_environment
 from dtsa_bench.flights.options import FlightOptions
 from dtsa_bench.flights.progress import FlightProgress, ProgressLine
 from dtsa_bench.flights.recorded_channel import BAG, RecordedFlight
@@ -109,12 +108,10 @@ class _MissionProcesses:
         avoid_last_processor()
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
-        mission = self._mission = GroundStation(node, self.settings, scenario, ended, self.progress.show)
-        mission.check_bridge_process = mission.check_bridge if self._attach else self.bridge.check
-        mission.start()
+        check = None if self._attach else self.bridge.check
+        mission = self._mission = GroundStation(node, self.settings, scenario, ended, self.progress.show, check)
         set_realtime(below(self.settings.station.priority, 1))
-        mission.connect()
-        swarm = mission.find_places(run.swarm)
+        swarm = mission.connect(run.swarm)
         if swarm != run.swarm:
             self.progress.print_line(f"not where they would begin: exchange of roles, places {swarm.places}")
             run = dataclasses.replace(run, swarm=swarm)
@@ -125,8 +122,7 @@ class _MissionProcesses:
         return run, mission
 
     def _start_agents(self, run: RunConfig) -> None:
-        settings, parameters = self.settings, self._directory / "parameters.yaml"
-        safety = settings.station.safety
+        settings, safety = self.settings, self.settings.station.safety
         own = {
             "command_hz": float(max(robot.command_rate_hz for robot in settings.robots)),
             "priority": below(settings.station.priority, 2),
@@ -134,11 +130,9 @@ class _MissionProcesses:
             "origin": list(settings.station.room_origin_in_world),
             "fence": safety.geofence, "fence_min": list(safety.geofence_min), "fence_max": list(safety.geofence_max),
         }  # fmt: skip
-        content = {"/**": {"ros__parameters": to_parameters(run.swarm.to_dict(), SwarmConfig) | own}}
-        parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-        self.agents.start("agents", list(range(1, run.swarm.agents + 1)), "dtsa_agent.crazyflie.node.agents_node",
-                          ["--ros-args", "--params-file", str(parameters), "--disable-external-lib-logs",
-                           "--disable-rosout-logs"])  # fmt: skip
+        arguments = parameter_arguments(self._directory, to_parameters(run.swarm.to_dict(), SwarmConfig) | own)
+        ids = list(range(1, run.swarm.agents + 1))
+        self.agents.start("agents", ids, "dtsa_agent.crazyflie.node.agents_node", arguments)
 
     def end(self, ended: StopToken) -> None:
         """All land, agents before; then the bridge ends, then the recorder closes its bag."""

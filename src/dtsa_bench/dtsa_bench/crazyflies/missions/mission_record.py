@@ -13,7 +13,6 @@ import math
 import signal
 import sys
 import time
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from dtsa_msgs.msg import Status
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from dtsa_agent.core.errors import DtsaError
@@ -42,44 +42,19 @@ _LEVELS = {10: "debug", 20: "info", 30: "warn", 40: "error", 50: "fatal"}
 _IN_FLIGHT = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
 
 
-@dataclass(slots=True)
-class VehicleLog:
-    """One vehicle's part."""
-
-    battery_first_v: float | None = None
-    battery_last_v: float | None = None
-    battery_least_v: float | None = None
-    link_quality_least: float = 1.0  # from arming on
-    log_age_most_s: float = 0.0
-    latency_most_ms: float = 0.0  # of a command, 99th percentile
-    states: list[dict[str, Any]] = field(default_factory=list)  # t_s, state, reason: each change
-
-
 class MissionLog:
     """Collects. For one thread, the executor's."""
 
     def __init__(self) -> None:
         self.began = time.time()
-        self.vehicles: dict[str, VehicleLog] = {}
+        self.statuses: dict[str, list[tuple[float, Status]]] = {}  # s since the beginning, by vehicle
         self.events: list[dict[str, Any]] = []
         self.diagnostics: dict[str, dict[str, float | str]] = {}  # what the bridge said last about each
         self.dropped = 0
 
     def status(self, name: str, message: Status) -> None:
         """A vehicle's status."""
-        log = self.vehicles.setdefault(name, VehicleLog())
-        volts = round(float(message.battery_voltage), 3)
-        if volts > 0.0:
-            log.battery_first_v = volts if log.battery_first_v is None else log.battery_first_v
-            log.battery_least_v = volts if log.battery_least_v is None else min(volts, log.battery_least_v)
-            log.battery_last_v = volts
-        if message.state in _IN_FLIGHT:
-            log.link_quality_least = min(log.link_quality_least, round(float(message.link_quality), 3))
-            log.log_age_most_s = max(log.log_age_most_s, round(float(message.log_age), 3))
-            log.latency_most_ms = max(log.latency_most_ms, round(float(message.latency_ms), 2))
-        if not log.states or log.states[-1]["state"] != message.state_name:
-            when = round(time.time() - self.began, 3)
-            log.states.append({"t_s": when, "state": message.state_name, "reason": message.reason})
+        self.statuses.setdefault(name, []).append((time.time() - self.began, message))
 
     def diagnostic(self, message: DiagnosticArray) -> None:
         """Diagnostics; only the bridge's count."""
@@ -98,18 +73,36 @@ class MissionLog:
 
     def write(self, directory: Path, reason: str) -> None:
         """Write `mission.json` in the flight's directory; `reason`: why the mission was cut short, or ""."""
-        logs = sorted(self.vehicles.items(), key=lambda item: (len(item[0]), item[0]))  # cf9 before cf10
+        names = sorted(self.statuses, key=lambda name: (len(name), name))  # cf9 before cf10
         content = {
             "began_unix_s": round(self.began, 3),
             "duration_s": round(time.time() - self.began, 3),
             "cut_short": reason,
-            "vehicles": {name: asdict(log) | {"last": self.diagnostics.get(name, {})} for name, log in logs},
+            "vehicles": {name: self._vehicle(self.statuses[name]) | {"last": self.diagnostics.get(name, {})}
+                         for name in names},
             "events": sorted(self.events, key=lambda event: event["t_s"]),
             "events_left_out": self.dropped,
-        }
+        }  # fmt: skip
         path = directory / "mission.json.part"
         path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         path.replace(directory / "mission.json")
+
+    @staticmethod
+    def _vehicle(statuses: list[tuple[float, Status]]) -> dict[str, Any]:
+        """One vehicle's part; link, ages and latency (of a command, 99th percentile) are those from arming on."""
+        volts = [v for _, message in statuses if (v := round(float(message.battery_voltage), 3)) > 0.0] or [None]
+        flying = [message for _, message in statuses if message.state in _IN_FLIGHT]
+        states: list[dict[str, Any]] = []  # each change
+        for t_s, message in statuses:
+            if not states or states[-1]["state"] != message.state_name:
+                states.append({"t_s": round(t_s, 3), "state": message.state_name, "reason": message.reason})
+        return {
+            "battery_first_v": volts[0], "battery_last_v": volts[-1], "battery_least_v": min(volts),
+            "link_quality_least": min([1.0, *(round(float(message.link_quality), 3) for message in flying)]),
+            "log_age_most_s": max([0.0, *(round(float(message.log_age), 3) for message in flying)]),
+            "latency_most_ms": max([0.0, *(round(float(message.latency_ms), 2) for message in flying)]),
+            "states": states,
+        }  # fmt: skip
 
 
 def _number(text: str) -> float | str:
@@ -122,18 +115,8 @@ def _number(text: str) -> float | str:
 
 
 # -- the bag ----------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class RecordedTopic:
-    """One topic that is recorded."""
-
-    handle: Any  # subscription
-    kind: type
-    channel: int
-    most: int  # messages read at once
-
-
-def subscribe_topics(node: Any, bag: BagWriter, names: list[str]) -> list[RecordedTopic]:
-    """Subscribe to everything that is recorded of these vehicles."""
+def record(node: Node, bag: BagWriter, names: list[str], over: list[int]) -> None:
+    """Record all of these vehicles until a signal has come (its number is in `over`), and then what is left."""
     recorded: list[tuple[Any, str, QoSProfile]] = [(Log, EVENTS, EVENTS_QOS), (DiagnosticArray, "/diagnostics", ALL)]
     for name in names:
         recorded += [
@@ -145,26 +128,20 @@ def subscribe_topics(node: Any, bag: BagWriter, names: list[str]) -> list[Record
     topics = []
     for kind, topic, qos in recorded:
         subscription = node.create_subscription(kind, topic, lambda message: None, qos)
-        package, type_name = kind.__module__.partition(".")[0], kind.__name__
-        channel = bag.add_topic(topic, f"{package}/msg/{type_name}")
-        topics.append(RecordedTopic(subscription.handle, kind, channel, qos.depth))
-    return topics
-
-
-def record(topics: list[RecordedTopic], bag: BagWriter, over: list[int]) -> None:
-    """Record until a signal has come (its number is in `over`), and then what is left."""
+        channel = bag.add_topic(topic, f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}")
+        topics.append((subscription.handle, kind, channel, qos.depth))
     last = False
     while not last:
         time.sleep(PERIOD_S)
         last = bool(over)
-        for topic in topics:
-            with topic.handle:
-                for _ in range(topic.most):
-                    received = topic.handle.take_message(topic.kind, True)
+        for handle, kind, channel, most in topics:
+            with handle:
+                for _ in range(most):
+                    received = handle.take_message(kind, True)
                     if received is None:
                         break
                     data, info = received
-                    bag.write(topic.channel, bytes(data), time.time_ns(), int(info["source_timestamp"]))
+                    bag.write(channel, bytes(data), time.time_ns(), int(info["source_timestamp"]))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -182,7 +159,7 @@ def main(argv: list[str] | None = None) -> int:
     node = rclpy.create_node("mission_recorder", enable_rosout=False, start_parameter_services=False)
     try:
         with BagWriter(args.bag, None, custom_data={"mission": "the station's clock"}) as bag:
-            record(subscribe_topics(node, bag, args.names), bag, over)
+            record(node, bag, args.names, over)
     except DtsaError as error:
         print(f"mission_recorder: {error}", file=sys.stderr)
         return 1

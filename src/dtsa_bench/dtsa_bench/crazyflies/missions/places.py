@@ -46,20 +46,15 @@ def check_places(settings: SwarmSettings, config: SwarmConfig) -> Scenario:
     if ids != list(range(1, config.agents + 1)):
         raise ConfigError("robots", ids, f"the ids 1 to {config.agents}, one for each agent")
     scenario = make_scenario(config)
-    wrong = misplaced(settings, scenario)
+    x0, y0, _ = settings.station.room_origin_in_world
+    wrong = {
+        robot.name: f"{robot.name} within {PLACE_M} m of ({x + x0:.2f}, {y + y0:.2f})"
+        for robot, (x, y) in zip(settings.robots, scenario.start[:2].T.tolist(), strict=True)
+        if np.hypot(robot.initial_position[0] - x0 - x, robot.initial_position[1] - y0 - y) > PLACE_M
+    }
     if wrong:
         raise ConfigError("initial_position", ", ".join(wrong), "; ".join(wrong.values()))
     return scenario
-
-
-def misplaced(settings: SwarmSettings, scenario: Scenario) -> dict[str, str]:
-    """Vehicles whose `initial_position` is not where the scenario begins, and where that is."""
-    x0, y0, _ = settings.station.room_origin_in_world
-    wrong = {}
-    for robot, (x, y) in zip(settings.robots, scenario.start[:2].T.tolist(), strict=True):
-        if np.hypot(robot.initial_position[0] - x0 - x, robot.initial_position[1] - y0 - y) > PLACE_M:
-            wrong[robot.name] = f"{robot.name} within {PLACE_M} m of ({x + x0:.2f}, {y + y0:.2f})"
-    return wrong
 
 
 def place_lines(settings: SwarmSettings) -> list[str]:
@@ -120,11 +115,8 @@ def check_standing(names: Sequence[str], measured: Array, fence: SafetySettings)
             outside = float(max((low - (x, y)).max(), ((x, y) - high).max()))
             if outside > fence.geofence_tolerance_m:
                 problems.append(f"{name} stands {outside:.2f} m outside the geofence at ({x:.2f}, {y:.2f})")
-    for a in range(len(names)):
-        for b in range(a):
-            distance = float(np.linalg.norm(measured[:2, a] - measured[:2, b]))
-            if distance < APART_M:
-                problems.append(f"{names[b]} and {names[a]} stand {distance:.2f} m apart")
+    a, b = np.tril_indices(len(names), -1)
+    problems += _too_close(names, np.linalg.norm(measured[:2, a] - measured[:2, b], axis=0), "stand {:.2f} m apart")
     if problems:
         raise MissionError(f"no take-off (at least {APART_M} m apart): {'; '.join(problems)}")
 
@@ -134,12 +126,12 @@ def check_crossings(scenario: Scenario, names: Sequence[str], measured: Array) -
 
     :raises MissionError: with the names and smallest distances of those that would come too close.
     """
-    goal, close = scenario.start[:2], []
-    for a in range(len(names)):
-        for b in range(a):
-            closest = _closest(measured[:2, a] - measured[:2, b], goal[:, a] - goal[:, b])
-            if closest < APART_M:
-                close.append(f"{names[b]} and {names[a]} would come within {closest:.2f} m")
+    a, b = np.tril_indices(len(names), -1)
+    before, after = (place[:2, a] - place[:2, b] for place in (measured, scenario.start))
+    change = after - before
+    square = (change**2).sum(axis=0)
+    when = np.clip(-(before * change).sum(axis=0) / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
+    close = _too_close(names, np.linalg.norm(before + when * change, axis=0), "would come within {:.2f} m")
     if close:
         raise MissionError(
             f"on the way to where they begin {'; '.join(close)}: put each on its place, or leave out --places, with "
@@ -147,9 +139,7 @@ def check_crossings(scenario: Scenario, names: Sequence[str], measured: Array) -
         )
 
 
-def _closest(begin: Array, end: Array) -> float:
-    """Smallest distance of two that fly straight at the same time, m, from their differences at both ends, (2,)."""
-    change = end - begin
-    square = float(change @ change)
-    when = 0.0 if square == 0.0 else min(1.0, max(0.0, -float(begin @ change) / square))
-    return float(np.linalg.norm(begin + when * change))
+def _too_close(names: Sequence[str], distances: Array, text: str) -> list[str]:
+    """Name the pairs that are too close, from the distances of all, in the order of `np.tril_indices`."""
+    pairs = zip(*np.tril_indices(len(names), -1), distances.tolist(), strict=True)
+    return [f"{names[b]} and {names[a]} {text.format(distance)}" for a, b, distance in pairs if distance < APART_M]

@@ -1,8 +1,7 @@
-"""The peer-to-peer laboratory: copies of a Crazyflie app fly in virtual time over one medium.
+"""The peer-to-peer laboratory: copies of a Crazyflie app (C, a function `appMain`) fly in virtual time over one medium.
 
-The app is C with a function `appMain`. It is compiled for this machine against own declarations of the firmware's
-documented functions (`firmware`), and each vehicle loads a private copy. The engine (`native`, C) runs the apps' tasks;
-the simulated Crazyflie is their world, the simulated radio their air. The same seed gives the same bits.
+The app is compiled for this machine against own declarations of the firmware's documented functions (`firmware`). The
+engine (`native`, C) runs the apps' tasks; the simulated Crazyflie is their world, the simulated radio their air.
 """
 
 from .app import App, LabSettings, read_app

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,40 +11,22 @@ from typing import Any
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 from dtsa_agent.yaml_file import read_yaml
-from dtsa_bench.crazyflies.simulated.fleet_config import start_positions
+from dtsa_bench.crazyflies.simulated.fleet_config import ellipse_positions
 from dtsa_bench.crazyflies.simulated.radio.air import BITRATES
 
 BUILT_IN = Path(__file__).parent / "apps"
-_KEYS = ("sources", "include", "flags", "parameters", "text")
-
-
-def _always(data: bytes, receiver: int) -> bool:
-    return True
-
-
-def _dtr_state(data: bytes, receiver: int) -> bool:
-    """Byte 1 is the kind of a packet (0: a state), byte 3 the id of its receiver."""
-    return len(data) > 3 and data[1] == 0 and data[3] == receiver
 
 
 @dataclass(frozen=True, slots=True)
 class App:
-    """An app.
+    """An app: C files, directories with its headers, and more for the compiler."""
 
-    :param name: what errors call it.
-    :param sources: C files.
-    :param include: directories with its headers.
-    :param flags: more for the compiler.
-    :param parameters: values of the app's parameters, set when a vehicle is switched on.
-    :param carries_state: whether a packet without its port tells a receiver (id) its sender's state: ages are those.
-    """
-
-    name: str
+    name: str  # what errors call it
     sources: tuple[Path, ...]
     include: tuple[Path, ...] = ()
     flags: tuple[str, ...] = ()
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    carries_state: Callable[[bytes, int], bool] = _always
+    parameters: Mapping[str, float] = field(default_factory=dict)  # set when a vehicle is switched on
+    addressed: bool = False  # byte 1 of a packet is its kind (0: a state), byte 3 the id of its receiver
 
 
 def read_app(
@@ -60,43 +42,40 @@ def read_app(
     if not directory.is_dir():
         names = ", ".join(sorted(path.name for path in BUILT_IN.iterdir() if path.is_dir()))
         raise ConfigError("app", str(place), f"a directory with C files, or one of {names}")
-    settings: Any = read_yaml(directory / "app.yaml", "app") if (directory / "app.yaml").exists() else {}
-    if not isinstance(settings, Mapping):
-        raise ConfigError("app.yaml", str(directory), "a mapping")
-    for key in settings:
-        if key not in _KEYS:
-            raise ConfigError(f"app.yaml, {key}", settings[key], "a key of " + ", ".join(_KEYS))
-    patterns = _texts(settings, "sources") or ("*.c", "src/*.c")
-    files = [Path(name) for pattern in patterns for name in sorted(glob.glob(str(directory / pattern)))]
+    own = _read_settings(directory / "app.yaml")
+    files = [Path(name) for pattern in own["sources"] for name in sorted(glob.glob(str(directory / pattern)))]
     files += [Path(name) for name in sources]
     if not files:
-        raise ConfigError("app", str(directory), f"a directory with C files ({', '.join(patterns)})")
+        raise ConfigError("app", str(directory), f"a directory with C files ({', '.join(own['sources'])})")
     for path in files:
         if not path.is_file():
             raise ConfigError("source", str(path), "a C file")
-    parameters = settings.get("parameters", {})
-    if not isinstance(parameters, Mapping) or not all(
-        isinstance(value, (int, float)) and not isinstance(value, bool) for value in parameters.values()
-    ):
-        raise ConfigError("app.yaml, parameters", parameters, "numbers by name")
-    places = [directory / name for name in _texts(settings, "include")]
+    places = [directory / name for name in own["include"]]
     return App(
         directory.resolve().name,
         tuple(path.resolve() for path in files),
         tuple(path.resolve() for path in (directory, *places, *map(Path, include))),
-        (*_texts(settings, "flags"), *flags),
-        dict(parameters),
-        _dtr_state if directory == BUILT_IN / "dtr" else _always,
+        (*own["flags"], *flags),
+        own["parameters"],
+        addressed=directory == BUILT_IN / "dtr",
     )
 
 
-def _texts(settings: Mapping[str, Any], key: str) -> tuple[str, ...]:
-    value = settings.get(key, ())
-    if isinstance(value, str):
-        value = value.split()
-    if not isinstance(value, (list, tuple)) or not all(isinstance(text, str) for text in value):
-        raise ConfigError(f"app.yaml, {key}", value, "a list of texts")
-    return tuple(value)
+def _read_settings(path: Path) -> dict[str, Any]:
+    settings: dict[str, Any] = {"sources": ["*.c", "src/*.c"], "include": [], "flags": [], "parameters": {}}
+    given = read_yaml(path, "app") if path.exists() else {}
+    if not isinstance(given, Mapping):
+        raise ConfigError("app.yaml", str(path), "a mapping")
+    for key, value in given.items():
+        if key not in settings:
+            raise ConfigError(f"app.yaml, {key}", value, "a key of " + ", ".join(settings))
+        if key == "parameters":
+            if not isinstance(value, Mapping) or any(type(number) not in (int, float) for number in value.values()):
+                raise ConfigError(f"app.yaml, {key}", value, "numbers by name")
+        elif not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+            raise ConfigError(f"app.yaml, {key}", value, "a list of texts")
+        settings[key] = value
+    return settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +118,6 @@ class LabSettings(Settings):
     def __post_init__(self) -> None:
         check(self)
         if self.start is None and self.radius_m:
-            circle = start_positions("ellipse", self.agents, (self.radius_m, self.radius_m))
-            object.__setattr__(self, "start", circle)
+            object.__setattr__(self, "start", ellipse_positions(self.agents, self.radius_m, self.radius_m))
         if self.polls * self.agents > 5000:
             raise ConfigError("polls", self.polls, f"at most {5000 / self.agents:g} for {self.agents} vehicles")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import math
 import struct
-from collections.abc import Callable, Mapping
 from ctypes import POINTER, Structure, c_char_p, c_double, c_int, c_int32, c_int64, c_uint8, c_uint64
 from enum import IntEnum
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_bench.crazyflies.simulated.crtp import LOG_TYPES, PARAM_TYPES, READ_ONLY, VariableEntry
 from dtsa_bench.crazyflies.simulated.firmware import FirmwareSetpoint
 
@@ -103,15 +102,9 @@ class Engine:
     """
 
     def __init__(
-        self,
-        library: Path,
-        count: int,
-        names: list[str],
-        parameters: list[str],
-        line_fixed_ns: int,
-        line_byte_ns: int,
-        spin_ns: int,
-    ) -> None:
+        self, library: Path, count: int, names: list[str], parameters: list[str], line_fixed_ns: int,
+        line_byte_ns: int, spin_ns: int,
+    ) -> None:  # fmt: skip
         self._library = ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)  # apps find the firmware's functions in it
         for name, (result, arguments) in _SIGNATURES.items():
             function = getattr(self._library, name)
@@ -120,7 +113,6 @@ class Engine:
         times = line_fixed_ns, line_byte_ns, spin_ns
         if self._library.lab_begin(count, len(names), texts, len(parameters), more, *times):
             raise MemoryError
-        self._run = self._library.lab_run
         #: Values of the firmware's log variables by vehicle, in the order of their names: written by the owner.
         self.firmware_logs: list[NDArray[np.float64]] = [
             np.ctypeslib.as_array(self._library.lab_log_values(k), (len(names),)) for k in range(count)
@@ -129,8 +121,7 @@ class Engine:
         self.firmware_parameters: list[NDArray[np.float64]] = [
             np.ctypeslib.as_array(self._library.lab_parameter_values(k), (len(parameters),)) for k in range(count)
         ]
-        self._variables: dict[tuple[int, int], dict[str, int]] = {}
-        self._told = _Report()
+        self._variables: dict[tuple[int, bool], dict[str, int]] = {}  # index by name, by vehicle: parameters, or logs
 
     def close(self) -> None:
         """Switch all off."""
@@ -138,8 +129,7 @@ class Engine:
 
     def run(self, until_ns: int) -> _Report:
         """Run the apps until a time, or until one asks or tells something: then `kind` is not NONE."""
-        self._told = self._run(until_ns).contents
-        return self._told
+        return self._library.lab_run(until_ns).contents  # type: ignore[no-any-return]
 
     def boot(
         self, vehicle: int, app: Path, now_ns: int, drift_ppb: int, address: int, channel: int, speed: int
@@ -152,7 +142,7 @@ class Engine:
         wrong = self._library.lab_boot(vehicle, str(app).encode(), now_ns, 0, drift_ppb, address, channel, speed)
         if wrong:
             raise AppError(f"app of agent {vehicle + 1}: {wrong.decode(errors='replace').replace(str(app), 'app')}")
-        for parameters in (0, 1):
+        for parameters in (False, True):
             count = self._library.lab_count(vehicle, parameters)
             names = (self._library.lab_name(vehicle, parameters, i).decode() for i in range(count))
             self._variables[vehicle, parameters] = {name: i for i, name in enumerate(names)}
@@ -160,8 +150,8 @@ class Engine:
     def off(self, vehicle: int) -> None:
         """Switch a vehicle off: its app and all that it knew are gone."""
         self._library.lab_off(vehicle)
-        self._variables.pop((vehicle, 0), None)
-        self._variables.pop((vehicle, 1), None)
+        self._variables.pop((vehicle, False), None)
+        self._variables.pop((vehicle, True), None)
 
     def receive(self, vehicle: int, now_ns: int, raw: bytes, rssi: int) -> bool:
         """A packet (port, data) has come to a vehicle's processor; False: its queue is full."""
@@ -171,49 +161,33 @@ class Engine:
         """A packet of the app channel has come to a vehicle; False: its queue is full."""
         return bool(self._library.lab_app_channel(vehicle, now_ns, data, len(data)))
 
+    # The app's own parameters and log variables, by name (group.name).
     def names(self, vehicle: int, *, parameters: bool) -> list[str]:
-        """Names of the app's parameters, or of its log variables, as group.name."""
-        return list(self._variables.get((vehicle, int(parameters)), ()))
+        """Names of the app's parameters, or of its log variables; none while it is switched off."""
+        return list(self._variables.get((vehicle, parameters), ()))
 
-    def type(self, vehicle: int, name: str, *, parameter: bool) -> int:
-        """Number of the type of a parameter or a log variable of the app, as the firmware has it."""
-        return int(self._library.lab_type(vehicle, int(parameter), self._variables[vehicle, int(parameter)][name]))
+    def _index(self, vehicle: int, name: str, parameter: bool) -> int:
+        names = self._variables.get((vehicle, parameter), {})
+        if name not in names:
+            what = "parameter" if parameter else "log variable"
+            raise ConfigError(what, name, f"of agent {vehicle + 1}: {', '.join(names) or 'none'}")
+        return names[name]
 
     def get(self, vehicle: int, name: str, *, parameter: bool) -> float:
-        """Value of a parameter or a log variable of the app; KeyError: it has none of that name, or is switched off."""
-        return float(self._library.lab_get(vehicle, int(parameter), self._variables[vehicle, int(parameter)][name]))
+        """Value of a parameter or a log variable of the app; ConfigError: none of that name, or switched off."""
+        return float(self._library.lab_get(vehicle, parameter, self._index(vehicle, name, parameter)))
 
     def set(self, vehicle: int, now_ns: int, name: str, value: float) -> None:
-        """Set a parameter of the app; KeyError: it has none of that name, or is switched off."""
-        self._library.lab_set(vehicle, now_ns, self._variables[vehicle, 1][name], value)
+        """Set a parameter of the app; ConfigError: none of that name, or switched off."""
+        self._library.lab_set(vehicle, now_ns, self._index(vehicle, name, True), value)
 
-
-class AppVariables:
-    """Parameters, log variables and app channel of one vehicle's app, as a ground station sees them."""
-
-    def __init__(
-        self, vehicle: int, engine: Engine, now: Callable[[], int], receive: Callable[[bytes], object]
-    ) -> None:
-        self._vehicle, self._engine, self._now, self.receive = vehicle, engine, now, receive
-        self.parameters = [self._entry(name, True) for name in engine.names(vehicle, parameters=True)]
-        self.logs = [self._entry(name, False) for name in engine.names(vehicle, parameters=False)]
-
-    def _entry(self, name: str, parameter: bool) -> VariableEntry:
-        group, _, rest = name.partition(".")
-        code = self._engine.type(self._vehicle, name, parameter=parameter)
-        text = (_PARAM_NAMES if parameter else _LOG_NAMES)[code & 15]
-        value = self.parameter(name) if parameter else 0.0
-        return VariableEntry(group, rest, text, value, read_only=parameter and bool(code & READ_ONLY))
-
-    def parameter(self, name: str) -> float:
-        """Value of one of its parameters."""
-        return self._engine.get(self._vehicle, name, parameter=True)
-
-    def set_parameter(self, name: str, value: float) -> None:
-        """Set one."""
-        self._engine.set(self._vehicle, self._now(), name, value)
-
-    def log_values(self) -> Mapping[str, float]:
-        """Values of its log variables, by their full names."""
-        names = self._engine.names(self._vehicle, parameters=False)
-        return {name: self._engine.get(self._vehicle, name, parameter=False) for name in names}
+    def entries(self, vehicle: int, *, parameters: bool) -> list[VariableEntry]:
+        """Parameters or log variables of the app, as a ground station sees them."""
+        found = []
+        for name, index in self._variables[vehicle, parameters].items():
+            code = self._library.lab_type(vehicle, parameters, index)
+            value = self.get(vehicle, name, parameter=True) if parameters else 0.0
+            group, _, rest = name.partition(".")
+            kind = (_PARAM_NAMES if parameters else _LOG_NAMES)[code & 15]
+            found.append(VariableEntry(group, rest, kind, value, read_only=parameters and bool(code & READ_ONLY)))
+        return found

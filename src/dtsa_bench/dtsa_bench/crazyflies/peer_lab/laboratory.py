@@ -7,7 +7,7 @@ import shutil
 import struct
 import tempfile
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,9 @@ from dtsa_bench.crazyflies.simulated.crtp import LOG_ENTRIES, PARAM_ENTRIES
 from dtsa_bench.crazyflies.simulated.estimate import log_values
 from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
 from dtsa_bench.crazyflies.simulated.motion import TICK_S, FleetMotion
-from dtsa_bench.crazyflies.simulated.peer import CrtpPeer
+from dtsa_bench.crazyflies.simulated.peer import CrtpPeer, OnboardApp
 from dtsa_bench.crazyflies.simulated.planner import DISABLED, FLYING, IDLE, LANDING
-from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, RATE_NAMES, TURN_NS, Agenda, RadioAir
+from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, RATE_NAMES, TURN_NS, RadioAir
 from dtsa_bench.crazyflies.simulated.truth import TruthLog
 from dtsa_channel_sim.model.air import Lines
 from dtsa_channel_sim.model.airtime import HEADER_BYTES, airtime_of
@@ -29,7 +29,7 @@ from dtsa_channel_sim.model.medium import Mask, OnAir
 
 from .app import App, LabSettings
 from .compiling import compile_app, engine_library
-from .engine import AppCommand, AppError, AppVariables, Engine, EngineEvent, decode_setpoint
+from .engine import AppCommand, AppError, Engine, EngineEvent, decode_setpoint
 from .polling import Polling
 from .record import Observer, PeerPacket, Record
 
@@ -41,6 +41,7 @@ _OWN_NAMES = ["lab.priority", "lab.planner"]
 _PLANNER = {IDLE: 0, FLYING: 1, LANDING: 3, DISABLED: 4}  # firmware/crtp_commander_high_level.h
 _NEAR_RSSI, _NEAREST_M = 40, 0.1  # -dBm at 1 m
 _FOREIGN_RSSI = 60
+_TAKE_OFF, _LAND = 7, 8  # packets of the high-level commander
 
 
 class Laboratory:
@@ -69,7 +70,7 @@ class Laboratory:
             engine_library(), count, [*_NAMES, *_OWN_NAMES], _KNOWN, line.to_fixed_ns, line.to_byte_ns,
             round(settings.spin_ms * 1e6),
         )  # fmt: skip
-        self.record = Record(count, app.carries_state, out)
+        self.record = Record(count, app.addressed, out)
         self._observers: tuple[Observer, ...] = (self.record, *observers)
         config = FleetConfig(
             count=count, start=settings.start, seed=settings.seed, noise=settings.noise, arming=settings.arming
@@ -80,6 +81,7 @@ class Laboratory:
         self.peers = [CrtpPeer(*both) for both in zip(self.motion.firmware, self.motion.estimates, strict=True)]
         streams = np.random.SeedSequence(settings.seed).spawn(2)
         self._open_air(int(streams[0].generate_state(1)[0]))
+        self.agenda = self.air.agenda
         self._lines = Lines(airtime, count)
         self.overflows = [0] * count  # receptions that found a radio's queue full
         self._handed: list[deque[PeerPacket]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
@@ -88,7 +90,7 @@ class Laboratory:
         self._on = [False] * count
         self._power_cycles = [0] * count  # how often each was switched off
         self._parameters: list[dict[str, float]] = [dict(app.parameters) for _ in range(count)]
-        self.polling = Polling(self.air, self.agenda, settings, self.receive_poll) if settings.polls else None
+        self.polling = Polling(self.air, settings, self.receive_poll) if settings.polls else None
         generator = np.random.default_rng(streams[1])
         starts = (generator.random(count) * settings.boot_s * 1e9).astype(np.int64).tolist()
         drifts = np.rint(generator.uniform(-1.0, 1.0, count) * settings.drift_ppm * 1000).astype(np.int64)
@@ -98,9 +100,9 @@ class Laboratory:
         self.agenda.at(TICK_NS, self._tick)
 
     def _open_air(self, seed: int) -> None:
-        """Make the time line, and the air with all vehicles, a ground station and a foreign radio."""
-        self.agenda, self._first = Agenda(), 1  # id on the air of the first vehicle
+        """Make the air with all vehicles, a ground station and a foreign radio."""
         self.air = RadioAir(self.settings.agents + 2, self.settings.loss, seed)
+        self._first = 1  # id on the air of the first vehicle
 
     def __enter__(self) -> Laboratory:
         return self
@@ -163,9 +165,8 @@ class Laboratory:
         k, now, data = report.vehicle, report.time_ns, bytes(report.data[: report.size])
         kind = EngineEvent(report.kind)
         if kind is EngineEvent.SEND:
-            packet = PeerPacket(k + 1, data, now)
+            packet, at_ns = PeerPacket(k + 1, data, now), report.other_ns
             self._notify("sent", k + 1, now, packet)
-            at_ns = report.other_ns
             self.agenda.at(at_ns, lambda: self._order_to_send(packet, at_ns))
         elif kind is EngineEvent.HEARD:
             packet = self._handed[k].popleft()
@@ -196,34 +197,33 @@ class Laboratory:
 
     def _command(self, k: int, command: AppCommand, data: bytes) -> int:
         firmware, t = self.motion.firmware[k], self.time
+        values = struct.unpack(f"<{len(data) // 4}f", data[: len(data) // 4 * 4])
         if command is AppCommand.SETPOINT:
             priority, setpoint = decode_setpoint(data, t, firmware.yaw)
             self.record.setpoints += 1
             firmware.offer(setpoint, priority)
-            return 0
-        if command is AppCommand.RELAX:
+        elif command is AppCommand.RELAX:
             firmware.notify_stop()
-            return 0
-        if command is AppCommand.DISABLE:
-            firmware.planner.disable()
-            return 0
-        if command is AppCommand.STOP:
-            return firmware.high_level(bytes((3, 0)), t)
-        values = struct.unpack(f"<{len(data) // 4}f", data)
-        if command is AppCommand.GO_TO:
-            return self._go_to(k, values[:3], values[3], values[4], bool(values[5]))
-        if command is AppCommand.ARM:
-            return int(firmware.supervisor.request_arming(bool(values[0])))
-        if command is AppCommand.RECOVER:
-            return int(firmware.supervisor.request_recovery())
-        if command is AppCommand.PARAMETER:
+        elif command is AppCommand.DISABLE:
+            firmware.planner.state = DISABLED
+        elif command is AppCommand.PARAMETER:
             self.peers[k].set_parameter(round(values[0]), values[1], t)
-            return 0
-        height, duration, yaw, keep = values
-        return self._rise(k, command is AppCommand.TAKEOFF, height, duration, yaw, bool(keep))
+        elif command is AppCommand.STOP:
+            return firmware.high_level(bytes((3, 0)), t)
+        elif command is AppCommand.GO_TO:
+            return self._go_to(k, values[:3], values[3], values[4], bool(values[5]))
+        elif command is AppCommand.ARM:
+            return int(firmware.supervisor.request_arming(bool(values[0])))
+        elif command is AppCommand.RECOVER:
+            return int(firmware.supervisor.request_recovery())
+        else:
+            height, duration, yaw, keep = values
+            kind = _TAKE_OFF if command is AppCommand.TAKEOFF else _LAND
+            return self._change_height(k, kind, height, duration, yaw, bool(keep))
+        return 0
 
-    def _rise(self, k: int, up: bool, height: float, duration: float, yaw: float = 0.0, keep: bool = True) -> int:
-        packet = struct.pack("<BBff?f", 7 if up else 8, 0, height, yaw, keep, duration)
+    def _change_height(self, k: int, kind: int, height: float, duration: float, yaw: float, keep: bool) -> int:
+        packet = struct.pack("<BBff?f", kind, 0, height, yaw, keep, duration)
         return self.motion.firmware[k].high_level(packet, self.time)
 
     def _go_to(self, k: int, place: Any, yaw: float, duration: float, relative: bool) -> int:
@@ -256,11 +256,12 @@ class Laboratory:
     # -- air --------------------------------------------------------------------------------------------------------
     def _order_to_send(self, packet: PeerPacket, at_ns: int) -> None:
         """A packet has come over the line to a radio: it is sent as soon as the radio can."""
-        length = len(packet.data)
-        start_ns = self._lines.start_ns(packet.sender, at_ns, length)
-        settings = self.settings
-        sender = self._first + packet.sender - 1
-        frame = self.air.send(settings.channel, settings.rate, sender, start_ns, HEADER_BYTES + length)
+        start_ns = self._lines.start_ns(packet.sender, at_ns, len(packet.data))
+        self._start_sending(packet, self._first + packet.sender - 1, start_ns)
+
+    def _start_sending(self, packet: PeerPacket, radio: int, start_ns: int) -> None:
+        length = HEADER_BYTES + len(packet.data)
+        frame = self.air.send(self.settings.channel, self.settings.rate, radio, start_ns, length)
         self.agenda.at(frame.end_ns, lambda: self._resolve(packet, frame))
 
     def _resolve(self, packet: PeerPacket, frame: OnAir) -> None:
@@ -326,8 +327,12 @@ class Laboratory:
         self._engine.boot(k, copy, self.now_ns, self._drifts[k], ADDRESS + agent, self.settings.channel, speed)
         copy.unlink()
         self._on[k] = True
-        take = partial(self.send, agent)
-        self.peers[k].adopt(AppVariables(k, self._engine, lambda: self.now_ns, take))
+        engine = self._engine
+        self.peers[k].adopt(OnboardApp(
+            engine.entries(k, parameters=True), engine.entries(k, parameters=False), partial(self.send, agent),
+            partial(engine.get, k, parameter=True), lambda name, value: engine.set(k, self.now_ns, name, value),
+            partial(self.logs, agent),
+        ))  # fmt: skip
         for name, value in self._parameters[k].items():
             self.set_parameter(agent, name, value)
 
@@ -344,47 +349,27 @@ class Laboratory:
             self.peers[k].reset()
 
     def set_parameter(self, agent: int, name: str, value: float) -> None:
-        """Set a parameter of the app, now and after each power on.
-
-        :param name: group.name.
-        :raises ConfigError: the app has none of that name.
-        """
+        """Set a parameter (group.name) of the app, now and after each power on; ConfigError: it has none such."""
         k = self._index(agent)
         self._parameters[k][name] = value
         if self._on[k]:
-            self._check_name(k, name, parameters=True)
             self._engine.set(k, self.now_ns, name, value)
 
     def parameter(self, agent: int, name: str) -> float:
-        """Value of a parameter of the app.
-
-        :raises ConfigError: the app has none of that name, or is switched off.
-        """
-        k = self._index(agent)
-        self._check_name(k, name, parameters=True)
-        return self._engine.get(k, name, parameter=True)
+        """Value of a parameter of the app; ConfigError: it has none of that name, or is switched off."""
+        return self._engine.get(self._index(agent), name, parameter=True)
 
     def log(self, agent: int, name: str) -> float:
-        """Value of a log variable, the firmware's or the app's.
-
-        :raises ConfigError: there is none of that name, or the vehicle is switched off.
-        """
+        """Value of a log variable, the firmware's or the app's; ConfigError: there is none, or it is switched off."""
         k = self._index(agent)
         if name in _NAMES:
             return float(self._engine.firmware_logs[k][_NAMES.index(name)])
-        self._check_name(k, name, parameters=False)
         return self._engine.get(k, name, parameter=False)
 
-    def logs(self, agent: int) -> Mapping[str, float]:
+    def logs(self, agent: int) -> dict[str, float]:
         """All log variables of the app; none while it is switched off."""
         k = self._index(agent)
         return {name: self._engine.get(k, name, parameter=False) for name in self._engine.names(k, parameters=False)}
-
-    def _check_name(self, k: int, name: str, *, parameters: bool) -> None:
-        names = self._engine.names(k, parameters=parameters)
-        if name not in names:
-            what = "parameter" if parameters else "log variable"
-            raise ConfigError(what, name, f"of agent {k + 1}: {', '.join(names) or 'none'}")
 
     def send(self, agent: int, data: bytes) -> bool:
         """A packet of the app channel; False: the app's queue of ten is full.
@@ -397,35 +382,32 @@ class Laboratory:
         return not self._on[k] or self._engine.app_channel(k, self.now_ns, data)
 
     def transmit(self, data: bytes, port: int = 0) -> None:
-        """A foreign radio on the channel sends a peer-to-peer packet now, whatever else is on the air.
-
-        :param data: at most 60 bytes.
-        """
-        packet, settings = PeerPacket(0, bytes((port,)) + data, self.now_ns), self.settings
-        radio = settings.agents + 2
-        frame = self.air.send(settings.channel, settings.rate, radio, self.now_ns, HEADER_BYTES + len(data))
-        self.agenda.at(frame.end_ns, lambda: self._resolve(packet, frame))
+        """A foreign radio on the channel sends a packet (at most 60 bytes) now, whatever else is on the air."""
+        packet = PeerPacket(0, bytes((port,)) + data, self.now_ns)
+        self._start_sending(packet, self.settings.agents + 2, self.now_ns)
 
     def set_loss(self, loss: float) -> None:
         """From now on receivers lose another share of frames."""
         self.air.set_loss(loss)
 
+    # Orders of the ground, by a vehicle's id; m, s. False: the firmware refuses.
     def arm(self, agent: int, arm: bool = True) -> bool:
-        """Arm or disarm; False: the firmware refuses."""
+        """Arm or disarm."""
         return self._then_update(agent, self.motion.firmware[self._index(agent)].supervisor.request_arming(arm))
 
     def take_off(self, agent: int, height: float, duration: float) -> bool:
-        """High-level take-off (m, s); False: the firmware refuses."""
-        return self._then_update(agent, self._rise(self._index(agent), True, height, duration) == 0)
+        """High-level take-off."""
+        error = self._change_height(self._index(agent), _TAKE_OFF, height, duration, 0.0, True)
+        return self._then_update(agent, not error)
 
     def land(self, agent: int, height: float, duration: float) -> bool:
-        """High-level landing (m, s); False: the firmware refuses."""
+        """High-level landing."""
         self.motion.firmware[self._index(agent)].notify_stop()
-        return self._then_update(agent, self._rise(self._index(agent), False, height, duration) == 0)
+        return self._then_update(agent, not self._change_height(agent - 1, _LAND, height, duration, 0.0, True))
 
     def go_to(self, agent: int, x: float, y: float, z: float, duration: float) -> bool:
-        """High-level flight to a place (m, s); False: the firmware refuses."""
-        return self._then_update(agent, self._go_to(self._index(agent), (x, y, z), 0.0, duration, False) == 0)
+        """High-level flight to a place."""
+        return self._then_update(agent, not self._go_to(self._index(agent), (x, y, z), 0.0, duration, False))
 
     def emergency(self, agent: int) -> None:
         """Emergency stop: latches until it is switched off and on."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +98,7 @@ class OnboardSwarm:
     :param out: directory for bags; None: none are made.
     :param key: 16 bytes, of sealed frames.
     :param enable_s: s, when the agents may steer; None: the ground is not played here.
-    :param flags: more of the compiler's, for the app.
+    :param app: the protocol's, with flags of its own; None: as it is.
     :raises ConfigError: for a swarm that the app cannot be.
     """
 
@@ -109,7 +109,7 @@ class OnboardSwarm:
         out: Path | None = None,
         key: bytes = b"",
         enable_s: float | None = 8.0,
-        flags: Sequence[str] = (),
+        app: App | None = None,
     ) -> None:
         check_onboard_swarm(swarm)
         if swarm.auth and len(key) != KEY_BYTES:
@@ -118,9 +118,7 @@ class OnboardSwarm:
         start = np.array(self.scenario.start)
         start[2] = 0.0  # on the floor
         settings = dataclasses.replace(lab, agents=swarm.agents, start=start)
-        app = read_app(APP)
-        app = dataclasses.replace(app, flags=(*app.flags, *flags))
-        self.lab = self._make_laboratory(app, settings, out)
+        self.lab = self._make_laboratory(app or read_app(APP), settings, out)
         self._flights = [
             None if out is None else _AgentFlight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
         ]
@@ -159,10 +157,6 @@ class OnboardSwarm:
         """An agent's new goal, (3,) m, frame map, of which the others hear nothing."""
         self.lab.send(agent, b"T" + struct.pack("<B3d", agent, *map(float, goal)))
 
-    def mute(self, agent: int) -> None:
-        """No frame of an agent gets on the air any more."""
-        self.lab.set_parameter(agent, "dtsa.mute", 1)
-
     def observe(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
         """What an app has noted goes into its bag."""
         if kind == "record" and (flight := self._flights[agent - 1]) is not None:
@@ -174,7 +168,7 @@ class OnboardSwarm:
     def __exit__(self, *unused: object) -> None:
         self.lab.close()
 
-    def finish(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """The flight is over: bags are closed; what came of it."""
         goal = np.array(self.scenario.target) + _UP
         away = np.sqrt(((goal - self.lab.motion.vehicles.position) ** 2).sum(axis=0))

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
-from dtsa_bench.crazyflies.simulated.radio.air import RATE_NAMES, Agenda, RadioAir
+from dtsa_bench.crazyflies.simulated.radio.air import RATE_NAMES, RadioAir
 from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, DongleModel
 from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, RadioReceiver
 
@@ -19,25 +19,19 @@ _STREAM = 0x706F6C6C  # of random numbers, besides those of losses and starts
 
 
 class Polling:
-    """One dongle that polls all vehicles in turn; `taken` gets an id and the time (s) when its radio has a packet."""
+    """One dongle that polls all vehicles in turn; `heard` gets an id and the time (s) when its radio has a packet."""
 
-    def __init__(
-        self, air: RadioAir, agenda: Agenda, settings: LabSettings, taken: Callable[[int, float], None]
-    ) -> None:
+    def __init__(self, air: RadioAir, settings: LabSettings, heard: Callable[[int, float], None]) -> None:
         count = settings.agents
         self.answered = 0
-        self._agenda = agenda
-        self._stations = [
-            RadioAddress("", settings.channel, settings.rate, bytes((0xE7, 0xE7, 0xE7, 0xE7, k + 1)))
-            for k in range(count)
-        ]
-        receivers = {
-            agent: RadioReceiver(station, lambda packet, t: None) for agent, station in enumerate(self._stations, 1)
-        }
-        for agent, receiver in receivers.items():
-            receiver.on_packet = partial(taken, agent)
-        radio = RadioSettings(seed=settings.seed, request_ms=0.0)
-        self._dongle = DongleModel(count + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
+        self._agenda = air.agenda
+        for agent in range(1, count + 1):
+            address = bytes((0xE7, 0xE7, 0xE7, 0xE7, agent))
+            receiver = RadioReceiver(RadioAddress("", settings.channel, settings.rate, address), lambda packet, t: None)
+            receiver.on_packet = partial(heard, agent)
+            air.receivers[agent] = receiver
+        self._stations = [receiver.station for receiver in air.receivers.values()]
+        self._dongle = DongleModel(count + 1, RadioSettings(seed=settings.seed, request_ms=0.0), air)
         self._dongle.request(SET_CHANNEL, settings.channel, 0, b"", 0)
         self._dongle.request(SET_RATE, RATE_NAMES.index(settings.rate), 0, b"", 0)
         self._gap_ns = round(1e9 / (settings.polls * count))
@@ -45,7 +39,7 @@ class Polling:
         self._busy = False
         self._random = np.random.default_rng([settings.seed, _STREAM])
         self._due_ns = self._gap_ns
-        agenda.at(self._due_ns, self._poll)
+        self._agenda.at(self._due_ns, self._poll)
 
     def _poll(self) -> None:
         """The next vehicle's turn; one transfer at a time, so a dongle that is behind skips turns."""

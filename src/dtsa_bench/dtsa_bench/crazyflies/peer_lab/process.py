@@ -7,7 +7,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,8 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.crazyflie.onboard import key_of
 
-from .app import App, LabSettings, read_app
-from .compiling import CompileError, sanitizer_environment
+from .app import App, LabSettings
+from .compiling import sanitizer_environment
 from .engine import AppError
 from .laboratory import Laboratory
 
@@ -25,29 +25,24 @@ _HEAD = "peer-lab: "
 
 
 def fly(
-    place: str,
+    app: App,
     seconds: float,
     settings: LabSettings | None = None,
     *,
-    sources: tuple[str, ...] = (),
-    include: tuple[str, ...] = (),
-    flags: tuple[str, ...] = (),
     parameters: Mapping[str, float] | None = None,
     out: Path | None = None,
     swarm: SwarmConfig | None = None,
 ) -> dict[str, Any]:
     """Fly an app; the summary, with `console` (what the apps printed), `warnings` (compiler, sanitizers), `logs`.
 
-    :param place: of the app, with `sources`, `include` and `flags`: as for `read_app`.
     :param seconds: s, virtual time.
-    :param parameters: values of the app's parameters, beside those of app.yaml.
+    :param parameters: values of the app's parameters, beside its own.
     :param out: directory for files.
     :param swarm: flies the protocol on board; None: the app is another one.
-    :raises ConfigError: a setting is not usable. :raises CompileError: the app does not compile.
+    :raises CompileError: the app does not compile.
     :raises AppError: an app crashed, or did what no app may do.
     """
-    app = read_app(place, sources=sources, include=include, flags=flags)  # a mistake needs no process
-    request = pickle.dumps((app, seconds, settings or LabSettings(), dict(parameters or {}), out, swarm, flags))
+    request = pickle.dumps((app, seconds, settings or LabSettings(), dict(parameters or {}), out, swarm))
     command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
     environment = {**os.environ, **sanitizer_environment(app)}
     done = subprocess.run(command, input=request, capture_output=True, check=False, env=environment)
@@ -63,42 +58,41 @@ def fly(
         last = (faults or lines or ["it printed nothing"])[-1]
         raise AppError(f"the laboratory's process ended with {done.returncode}: {last}")
     answer = pickle.loads(done.stdout)
-    if isinstance(answer, dict):
-        return {**answer, "warnings": answer["warnings"] + errors}
-    kind, text = answer
-    raise (kind if kind in (CompileError, AppError) else DtsaError)(text)
+    if isinstance(answer, DtsaError):
+        raise answer
+    return {**answer, "warnings": answer["warnings"] + errors}
 
 
 def _fly(
     app: App, seconds: float, settings: LabSettings, parameters: Mapping[str, float], out: Path | None,
-    swarm: SwarmConfig | None, flags: tuple[str, ...],
+    swarm: SwarmConfig | None,
 ) -> dict[str, Any]:  # fmt: skip
-    finish: Callable[[], dict[str, Any]]
+    flight: Any
     if swarm is None:
-        lab = Laboratory(app, settings, out)
-        finish = lab.summary
+        flight = lab = Laboratory(app, settings, out)
     else:
         from .onboard import OnboardSwarm  # the log: others do without
 
-        flight = OnboardSwarm(swarm, settings, out, key_of(swarm), flags=flags)
-        lab, finish = flight.lab, flight.finish
+        flight = OnboardSwarm(swarm, settings, out, key_of(swarm), app=app)
+        lab = flight.lab
     with lab:
+        agents = range(1, lab.settings.agents + 1)
         for name, value in parameters.items():
-            for agent in range(1, lab.settings.agents + 1):
+            for agent in agents:
                 lab.set_parameter(agent, name, value)
         lab.run(seconds)
-        logs = {str(agent): dict(lab.logs(agent)) for agent in range(1, lab.settings.agents + 1)}
-        return {**finish(), "console": lab.record.console, "warnings": lab.warnings, "logs": logs}
+        logs = {str(agent): lab.logs(agent) for agent in agents}
+        return {**flight.summary(), "console": lab.record.console, "warnings": lab.warnings, "logs": logs}
 
 
 def main() -> int:
     """The process: a request on standard input, the answer on standard output."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    answer: Any
+    answer: dict[str, Any] | DtsaError
     try:
         answer = _fly(*pickle.loads(sys.stdin.buffer.read()))
     except DtsaError as error:
-        answer = type(error), str(error)
+        answer = error
     sys.stdout.buffer.write(pickle.dumps(answer))
     return 0
 

@@ -49,26 +49,24 @@ class StateAges:
         if self._stamp[pair] < 0:
             self._since[pair] = now_ns
         else:
-            self._add(pair, now_ns)
+            self._advance(pair, now_ns)
         self._stamp[pair], self._last[pair] = stamp_ns, now_ns
 
-    def _add(self, pair: tuple[int, int], now_ns: int) -> None:
-        first, last = int(self._last[pair] - self._stamp[pair]), int(now_ns - self._stamp[pair])
-        self._area[pair] += (first + last) / 2e6 * (now_ns - int(self._last[pair])) / 1e9
-        self._worst[pair] = max(int(self._worst[pair]), last)
+    def _advance(self, pairs: Any, now_ns: int) -> None:
+        first, last = self._last[pairs] - self._stamp[pairs], now_ns - self._stamp[pairs]
+        self._area[pairs] += (first + last) / 2e6 * (now_ns - self._last[pairs]) / 1e9
+        self._worst[pairs] = np.maximum(self._worst[pairs], last)
+        self._last[pairs] = now_ns
 
     def summary(self, now_ns: int) -> dict[str, Any]:
         """Mean and largest age in ms until the end, and the share of pairs that know each other."""
-        known = list(zip(*(index.tolist() for index in np.nonzero(self._stamp >= 0)), strict=True))
-        for pair in known:
-            self._add(pair, now_ns)
-            self._last[pair] = now_ns
-        pairs = len(self._stamp) * (len(self._stamp) - 1)
-        seconds = sum((now_ns - int(self._since[pair])) / 1e9 for pair in known)
+        known, pairs = self._stamp >= 0, len(self._stamp) * (len(self._stamp) - 1)
+        self._advance(known, now_ns)
+        seconds = sum(((now_ns - self._since[known]) / 1e9).tolist())
         return {
-            "mean_age_ms": sum(float(self._area[pair]) for pair in known) / seconds if seconds else None,
-            "largest_age_ms": max(int(self._worst[pair]) for pair in known) / 1e6 if known else None,
-            "pairs_known": len(known) / pairs if pairs else 1.0,
+            "mean_age_ms": sum(self._area[known].tolist()) / seconds if seconds else None,
+            "largest_age_ms": int(self._worst[known].max()) / 1e6 if known.any() else None,
+            "pairs_known": int(known.sum()) / pairs if pairs else 1.0,
         }
 
 
@@ -79,11 +77,18 @@ class StateAges:
 Observer = Callable[[str, int, int, Any], None]
 
 
-class Record:
-    """Counts, ages, distances, and the digest of all of it; with a directory, a file of all packets."""
+#: Codes of kinds in the digest; an app's command has the code 2 and more.
+_CODES = {"sent": 0, "heard": 1, "command": 2, "print": 20, "event": 21, "positions": 22, "record": 23}
 
-    def __init__(self, agents: int, carries_state: Callable[[bytes, int], bool], directory: Path | None = None) -> None:
-        self._carries_state, self._ages, self._digest = carries_state, StateAges(agents), hashlib.sha256()
+
+class Record:
+    """Counts, ages, distances, and the digest of all of it; with a directory, a file of all packets.
+
+    :param addressed: as of `App`: which packets tell a receiver its sender's state.
+    """
+
+    def __init__(self, agents: int, addressed: bool, directory: Path | None = None) -> None:
+        self._addressed, self._ages, self._digest = addressed, StateAges(agents), hashlib.sha256()
         self.agents = agents
         self.sent, self.heard = [0] * agents, [0] * agents
         self.setpoints = 0
@@ -98,47 +103,40 @@ class Record:
 
     def __call__(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
         """See `Observer`."""
-        if (note := getattr(self, f"_note_{kind}", None)) is not None:
-            note(agent, now_ns, content)
+        if kind not in _CODES:
+            return
+        code, data = _CODES[kind], content
+        if kind in ("sent", "heard"):
+            data = content.raw
+            self._add_packet(kind, agent, now_ns, content)
+        elif kind == "command":
+            code, data = code + content[0], content[1]
+        elif kind == "print":
+            data = content.encode()
+            *lines, rest = (self._lines.get(agent, "") + content).split("\n")
+            self._lines[agent] = rest
+            self.console += [(now_ns / 1e9, agent, line) for line in lines]
+        elif kind == "event":
+            data = content.encode()
+            if content in ("crash", "hard landing"):
+                self.crashed.setdefault(agent, now_ns / 1e9)
+        elif kind == "positions":
+            data = np.ascontiguousarray(content).tobytes()
+            self._add_positions(now_ns, content)
+        self._digest.update(struct.pack("<BHqI", code, agent, now_ns, len(data)) + data)
 
-    def _digest_update(self, kind: int, agent: int, now_ns: int, data: bytes) -> None:
-        self._digest.update(struct.pack("<BHqI", kind, agent, now_ns, len(data)) + data)
-
-    def _line(self, **entry: Any) -> None:
+    def _add_packet(self, kind: str, agent: int, now_ns: int, packet: PeerPacket) -> None:
+        (self.sent if kind == "sent" else self.heard)[agent - 1] += 1
         if self._file is not None:
-            self._file.write(json.dumps(entry) + "\n")
-
-    def _note_sent(self, agent: int, now_ns: int, packet: PeerPacket) -> None:
-        self.sent[agent - 1] += 1
-        self._digest_update(0, agent, now_ns, packet.raw)
-        self._line(t_ns=now_ns, sent=agent, port=packet.raw[0], data=packet.data.hex())
-
-    def _note_heard(self, agent: int, now_ns: int, packet: PeerPacket) -> None:
-        self.heard[agent - 1] += 1
-        self._digest_update(1, agent, now_ns, packet.raw)
-        self._line(t_ns=now_ns, heard=agent, sender=packet.sender, port=packet.raw[0], data=packet.data.hex())
-        if packet.sender and self._carries_state(packet.data, agent):
+            sender = {"sender": packet.sender} if kind == "heard" else {}
+            line = {"t_ns": now_ns, kind: agent, **sender, "port": packet.raw[0], "data": packet.data.hex()}
+            self._file.write(json.dumps(line) + "\n")
+        data = packet.data
+        is_state = not self._addressed or (len(data) > 3 and data[1] == 0 and data[3] == agent)
+        if kind == "heard" and packet.sender and is_state:
             self._ages.add_state(agent, packet.sender, packet.ordered_ns, now_ns)
 
-    def _note_command(self, agent: int, now_ns: int, command: tuple[int, bytes]) -> None:
-        self._digest_update(2 + command[0], agent, now_ns, command[1])
-
-    def _note_print(self, agent: int, now_ns: int, text: str) -> None:
-        self._digest_update(20, agent, now_ns, text.encode())
-        *lines, rest = (self._lines.get(agent, "") + text).split("\n")
-        self._lines[agent] = rest
-        self.console += [(now_ns / 1e9, agent, line) for line in lines]
-
-    def _note_record(self, agent: int, now_ns: int, data: bytes) -> None:
-        self._digest_update(23, agent, now_ns, data)
-
-    def _note_event(self, agent: int, now_ns: int, name: str) -> None:
-        self._digest_update(21, agent, now_ns, name.encode())
-        if name in ("crash", "hard landing"):
-            self.crashed.setdefault(agent, now_ns / 1e9)
-
-    def _note_positions(self, agent: int, now_ns: int, position: NDArray[np.float64]) -> None:
-        self._digest_update(22, 0, now_ns, np.ascontiguousarray(position).tobytes())
+    def _add_positions(self, now_ns: int, position: NDArray[np.float64]) -> None:
         flying = np.flatnonzero(position[2] > _FLYING_M)
         if len(flying) > 1:
             p = position[:, flying]

@@ -1,7 +1,6 @@
-"""Simulated Crazyflies over UDP: unmodified cflib connects to them.
+"""Simulated Crazyflies: unmodified cflib connects to them.
 
-They fly the project's own vehicle model behind the firmware's commander, high-level commander and supervisor, with its
-watchdogs, and fail on command. For tests of the bridge, and a training ground for its users.
+They fly the project's vehicle model behind the firmware's commander and supervisor, and fail on command.
 """
 
 from .fleet import Fleet

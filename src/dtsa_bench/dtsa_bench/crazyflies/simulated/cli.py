@@ -1,4 +1,4 @@
-"""Command line of the simulated fleet: `dtsa fake-crazyflie`, and the executable `fake_crazyflie`."""
+"""Command line of the simulated fleet: `dtsa fake-crazyflie`."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.priority import set_realtime
-from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
-from dtsa_bench.crazyflies.simulated.radio.side import DongleServer
 from dtsa_bench.runs.options import add_options, given_options, whole_number
 
-from .fleet import NUMBERS, Fleet
-from .fleet_config import LAYOUTS, FleetConfig, start_positions
-from .process import FAULTS, send_fault
+from .fleet import Fleet
+from .fleet_config import FleetConfig, RadioAddress, RadioSettings
+from .process import DIRECTIONS, FAULTS, NUMBERS, send_fault
 
 DESCRIPTION = """\
 Simulated Crazyflies over UDP: cflib, its client and the Crazyflie bridge connect to them as to real ones.
@@ -31,10 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     add_options(parser, FleetConfig, "fleet")
     parser.add_argument("--config", type=Path, help="swarm.yaml: count, ports and start positions come from its robots")
-    parser.add_argument("--layout", choices=LAYOUTS, default="ellipse", help="start positions (%(default)s)")
-    parser.add_argument(
-        "--half-axes", type=float, nargs=2, default=(1.2, 2.0), metavar=("X", "Y"), help="m, of the layout (1.2 2.0)"
-    )
     parser.add_argument("--truth", type=Path, metavar="FILE", help="record of what really happened (JSON lines)")
     parser.add_argument(
         "--priority",
@@ -63,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument("--fault", choices=FAULTS, help="; ".join(f"{k}: {v}" for k, v in FAULTS.items()))
     faults.add_argument("--cf", default="all", help="id of the vehicle (default: all)")
     faults.add_argument("--rate", type=float, help="drop: share of the datagrams that is lost")
-    faults.add_argument("--direction", choices=("up", "down", "both"), help="drop: up is from the host")
+    faults.add_argument("--direction", choices=DIRECTIONS, help="drop: up is from the host")
     faults.add_argument("--distance", type=float, help="estimate_jump: m")
     faults.add_argument("--dongle", type=int, help="unplug: number of the dongle")
     faults.add_argument("--voltage", type=float, help="battery: V")
@@ -74,27 +68,29 @@ def fleet_config(args: argparse.Namespace) -> FleetConfig:
     """Configuration from the command line."""
     radio = RadioSettings(**given_options(args, RadioSettings, "radio"), path=args.simulated_radio)
     options = {**given_options(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
-    if args.config is not None:
-        return _from_swarm(args.config, options)
-    if radio.path is not None:
+    if args.dongles_only:
+        if radio.path is None or args.config is not None:
+            raise ConfigError("dongles_only", True, "with --simulated-radio SOCKET, and without --config")
+        options["count"] = 0
+    elif args.config is not None:
+        options |= _robots_of(args.config, radio, options.get("count"))
+    elif radio.path is not None:
         allowed = "--config FILE with --simulated-radio: its URIs say where they listen; or --dongles-only"
         raise ConfigError("config", None, allowed)
-    config = FleetConfig(**options)
-    start = start_positions(args.layout, config.count, tuple(args.half_axes))
-    return dataclasses.replace(config, start=start)
+    return FleetConfig(**options)
 
 
-def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
+def _robots_of(path: Path, radio: RadioSettings, count: int | None) -> dict[str, Any]:
+    """The settings that a swarm's YAML gives; `count`: what the user wants, too."""
     import numpy as np
 
     from dtsa_agent.crazyflie.settings import load_swarm
 
     robots = load_swarm(path).robots
-    start = np.array([robot.initial_position for robot in robots]).T
-    radio: RadioSettings = options["radio"]
+    found = {"count": len(robots), "start": np.array([robot.initial_position for robot in robots]).T}
     if radio.path is not None:
-        radio = dataclasses.replace(radio, stations=tuple(RadioAddress.of(robot.uri) for robot in robots))
-        return FleetConfig(**{**options, "count": len(robots), "start": start, "radio": radio})
+        stations = tuple(RadioAddress.of(robot.uri) for robot in robots)
+        return {**found, "radio": dataclasses.replace(radio, stations=stations)}
     ports = []
     for robot in robots:
         if not robot.uri.startswith("udp://"):
@@ -102,30 +98,25 @@ def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
         ports.append(int(robot.uri.rpartition(":")[2]))
     if ports != list(range(ports[0], ports[0] + len(ports))):
         raise ConfigError("robots", ports, "ports that follow each other, in the order of the robots")
-    if options.get("count") not in (None, len(ports)):
-        raise ConfigError("count", options["count"], f"{len(ports)}, as in {path}")
-    return FleetConfig(**{**options, "count": len(ports), "base_port": ports[0], "start": start})
+    if count not in (None, len(ports)):
+        raise ConfigError("count", count, f"{len(ports)}, as in {path}")
+    return {**found, "base_port": ports[0]}
 
 
 def request_fault(args: argparse.Namespace) -> None:
     """Send a fault to a running fleet; ConfigError: no fleet listens, or it was refused."""
-    cf: object = args.cf
-    if args.cf != "all":
-        try:
-            cf = int(args.cf)
-        except ValueError:
-            raise ConfigError("cf", args.cf, "an id, or all") from None
-    numbers = {name: getattr(args, name) for name in NUMBERS if getattr(args, name) is not None}
+    if args.cf != "all" and not args.cf.isdecimal():
+        raise ConfigError("cf", args.cf, "an id, or all")
+    cf = args.cf if args.cf == "all" else int(args.cf)
+    given = {name: getattr(args, name) for name in (*NUMBERS, "direction") if getattr(args, name) is not None}
     port = FleetConfig(**given_options(args, FleetConfig, "fleet")).control_port
-    send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **numbers)
+    send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **given)
     print(f"{args.fault}: cf {args.cf}")
 
 
 def status_line(fleet: Fleet) -> str:
     """One line about the fleet."""
-    states: dict[str, int] = {}
-    for firmware in fleet.firmware:
-        states[firmware.supervisor.state] = states.get(firmware.supervisor.state, 0) + 1
+    states = Counter(firmware.supervisor.state for firmware in fleet.firmware)
     lowest = min(firmware.battery.voltage for firmware in fleet.firmware)
     text = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
     return f"{fleet.time:7.1f} s  {text}; lowest battery {lowest:.2f} V"
@@ -141,43 +132,25 @@ def run(args: argparse.Namespace) -> int:
 
         follow_supervisor()
     priority = whole_number(args.priority, "priority", 0, 90)
-    if args.dongles_only:
-        return _run_dongles(args, priority)
     fleet = Fleet(fleet_config(args))
+    config, radio = fleet.config, fleet.config.radio
     set_realtime(priority)
-    _end_by_signals(fleet.stop, args.ignore_interrupt)
-    for uri in fleet.config.uris:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: fleet.stop())
+    if args.ignore_interrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for uri in config.uris:
         print(uri)
-    print(
-        f"{fleet.config.count} simulated Crazyflies, protocol {fleet.config.protocol}; faults: UDP port "
-        f"{fleet.config.control_port}; Ctrl-C ends",
-        flush=True,
-    )
-    if not args.quiet:
+    text = f"{radio.dongles} simulated Crazyradios at {radio.path}"
+    if count := config.count:
+        text = f"{count} simulated Crazyflies, protocol {config.protocol}; faults: UDP port {config.control_port}"
+    print(f"{text}; Ctrl-C ends", flush=True)
+    quiet = args.quiet or not count
+    if not quiet:
         _show_status(fleet)
     fleet.run()
-    if not args.quiet:
+    if not quiet:
         print(status_line(fleet))
-    return 0
-
-
-def _end_by_signals(stop: Callable[[], None], ignore_interrupt: bool) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop())
-    if ignore_interrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _run_dongles(args: argparse.Namespace, priority: int) -> int:
-    """Simulated Crazyradios alone, until Ctrl-C; exit code."""
-    if args.simulated_radio is None or args.config is not None:
-        raise ConfigError("dongles_only", True, "with --simulated-radio SOCKET, and without --config")
-    settings = RadioSettings(**given_options(args, RadioSettings, "radio"), path=args.simulated_radio)
-    dongles = DongleServer(settings)
-    set_realtime(priority)
-    _end_by_signals(dongles.stop, args.ignore_interrupt)
-    print(f"{settings.dongles} simulated Crazyradios at {settings.path}; Ctrl-C ends", flush=True)
-    dongles.run()
     return 0
 
 
@@ -195,23 +168,3 @@ def _show_status(fleet: Fleet) -> None:
             print(f"\r{line}          " if terminal else line, end=end, flush=True)
 
     fleet.shown = show
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Entry point of the executable."""
-    parser = argparse.ArgumentParser(
-        prog="fake_crazyflie",
-        description=DESCRIPTION,
-        allow_abbrev=False,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add_arguments(parser)
-    try:
-        return run(parser.parse_args(argv))
-    except ConfigError as error:
-        print(f"fake_crazyflie: {error}", file=sys.stderr)
-        return 2
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,19 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 MAX_DATA = 30
-
 # Ports
-CONSOLE = 0
-PARAM = 2
-COMMANDER = 3
-MEMORY = 4
-LOG = 5
-LOCALIZATION = 6
-GENERIC_COMMANDER = 7
-HIGH_LEVEL = 8
-SUPERVISOR = 9
-PLATFORM = 13
-LINK = 15
+CONSOLE, PARAM, COMMANDER, MEMORY, LOG, LOCALIZATION = 0, 2, 3, 4, 5, 6
+GENERIC_COMMANDER, HIGH_LEVEL, SUPERVISOR, PLATFORM, LINK = 7, 8, 9, 13, 15
 
 
 def pack(port: int, channel: int, data: bytes) -> bytes:
@@ -46,30 +36,17 @@ def unpack(datagram: bytes) -> tuple[int, int, bytes] | None:
     return header >> 4, header & 3, datagram[1:]
 
 
-# -- tables of contents ------------------------------------------------------------------------------------------------
+# -- tables of contents: code and struct format by type ----------------------------------------------------------------
 LOG_TYPES = {
-    "uint8_t": (1, "B"),
-    "uint16_t": (2, "H"),
-    "uint32_t": (3, "I"),
-    "int8_t": (4, "b"),
-    "int16_t": (5, "h"),
-    "int32_t": (6, "i"),
-    "float": (7, "f"),
-    "FP16": (8, "e"),
-}
+    "uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int8_t": (4, "b"), "int16_t": (5, "h"),
+    "int32_t": (6, "i"), "float": (7, "f"), "FP16": (8, "e"),
+}  # fmt: skip
 PARAM_TYPES = {
-    "uint8_t": (0x08, "B"),
-    "uint16_t": (0x09, "H"),
-    "uint32_t": (0x0A, "I"),
-    "int8_t": (0x00, "b"),
-    "int16_t": (0x01, "h"),
-    "int32_t": (0x02, "i"),
-    "float": (0x06, "f"),
-}
+    "uint8_t": (0x08, "B"), "uint16_t": (0x09, "H"), "uint32_t": (0x0A, "I"), "int8_t": (0x00, "b"),
+    "int16_t": (0x01, "h"), "int32_t": (0x02, "i"), "float": (0x06, "f"),
+}  # fmt: skip
 READ_ONLY = 0x40
 LOG_FORMAT_BY_CODE = dict(LOG_TYPES.values())
-LOG_LIMITS = {"B": (0, 255), "H": (0, 65535), "I": (0, 2**32 - 1), "b": (-128, 127), "h": (-32768, 32767)}
-LOG_LIMITS["i"] = (-(2**31), 2**31 - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,51 +65,43 @@ class VariableEntry:
         return f"{self.group}.{self.name}"
 
 
-def _log(group: str, type_name: str, *names: str) -> list[VariableEntry]:
-    return [VariableEntry(group, name, type_name) for name in names]
-
-
-LOG_ENTRIES: tuple[VariableEntry, ...] = (
-    *_log("stateEstimateZ", "int16_t", "x", "y", "z", "vx", "vy", "vz"),
-    *_log("stateEstimateZ", "uint32_t", "quat"),
-    *_log("stateEstimateZ", "int16_t", "rateRoll", "ratePitch", "rateYaw"),
-    *_log("stateEstimate", "float", "x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw"),
-    *_log("pm", "uint16_t", "vbatMV"),
-    *_log("pm", "float", "vbat"),
-    *_log("pm", "int8_t", "state"),
-    *_log("pm", "uint8_t", "batteryLevel"),
-    *_log("supervisor", "uint16_t", "info"),
-    *_log("sys", "uint8_t", "canfly", "isFlying", "isTumbled"),
-    *_log("kalman", "float", "varPX", "varPY", "varPZ"),
-    *_log("radio", "uint8_t", "rssi"),
+_LOGS = (
+    ("int16_t", "stateEstimateZ", "x y z vx vy vz"),
+    ("uint32_t", "stateEstimateZ", "quat"),
+    ("int16_t", "stateEstimateZ", "rateRoll ratePitch rateYaw"),
+    ("float", "stateEstimate", "x y z vx vy vz roll pitch yaw"),
+    ("uint16_t", "pm", "vbatMV"),
+    ("float", "pm", "vbat"),
+    ("int8_t", "pm", "state"),
+    ("uint8_t", "pm", "batteryLevel"),
+    ("uint16_t", "supervisor", "info"),
+    ("uint8_t", "sys", "canfly isFlying isTumbled"),
+    ("float", "kalman", "varPX varPY varPZ"),
+    ("uint8_t", "radio", "rssi"),
 )
-
-PARAM_ENTRIES: tuple[VariableEntry, ...] = (
-    VariableEntry("kalman", "resetEstimation", "uint8_t", 0),
-    VariableEntry("kalman", "initialX", "float", 0.0),
-    VariableEntry("kalman", "initialY", "float", 0.0),
-    VariableEntry("kalman", "initialZ", "float", 0.0),
-    VariableEntry("locSrv", "extPosStdDev", "float", 0.01),
-    VariableEntry("locSrv", "extQuatStdDev", "float", 4.5e-3),
-    VariableEntry("stabilizer", "estimator", "uint8_t", 2),
-    VariableEntry("stabilizer", "controller", "uint8_t", 1),
-    VariableEntry("stabilizer", "stop", "uint8_t", 0),
-    VariableEntry("commander", "enHighLevel", "uint8_t", 1),
-    VariableEntry("hlCommander", "vtoff", "float", 0.5),
-    VariableEntry("hlCommander", "vland", "float", 0.5),
-    VariableEntry("hlCommander", "groupmask", "uint8_t", 0),
-    VariableEntry("posCtlPid", "xVelMax", "float", 1.0),
-    VariableEntry("posCtlPid", "yVelMax", "float", 1.0),
-    VariableEntry("posCtlPid", "zVelMax", "float", 1.0),
-    VariableEntry("ring", "effect", "uint8_t", 6),
-    VariableEntry("led", "bitmask", "uint8_t", 0),
-    VariableEntry("usd", "logging", "uint8_t", 0),
-    VariableEntry("colAv", "enable", "uint8_t", 0),
-    VariableEntry("firmware", "revision0", "uint32_t", 0xD75A0001, read_only=True),
-    VariableEntry("firmware", "modified", "uint8_t", 0, read_only=True),
-    VariableEntry("deck", "bcLighthouse4", "uint8_t", 1, read_only=True),
+_PARAMETERS: tuple[tuple[str, str, dict[str, float]], ...] = (
+    ("uint8_t", "kalman", {"resetEstimation": 0}),
+    ("float", "kalman", {"initialX": 0.0, "initialY": 0.0, "initialZ": 0.0}),
+    ("float", "locSrv", {"extPosStdDev": 0.01, "extQuatStdDev": 4.5e-3}),
+    ("uint8_t", "stabilizer", {"estimator": 2, "controller": 1, "stop": 0}),
+    ("uint8_t", "commander", {"enHighLevel": 1}),
+    ("float", "hlCommander", {"vtoff": 0.5, "vland": 0.5}),
+    ("uint8_t", "hlCommander", {"groupmask": 0}),
+    ("float", "posCtlPid", {"xVelMax": 1.0, "yVelMax": 1.0, "zVelMax": 1.0}),
+    ("uint8_t", "ring", {"effect": 6}),
+    ("uint8_t", "led", {"bitmask": 0}),
+    ("uint8_t", "usd", {"logging": 0}),
+    ("uint8_t", "colAv", {"enable": 0}),
+    ("uint32_t", "firmware", {"revision0": 0xD75A0001}),
+    ("uint8_t", "firmware", {"modified": 0}),
+    ("uint8_t", "deck", {"bcLighthouse4": 1}),
 )
-
+LOG_ENTRIES = tuple(VariableEntry(group, name, type_) for type_, group, names in _LOGS for name in names.split())
+PARAM_ENTRIES = tuple(
+    VariableEntry(group, name, type_, value, read_only=group in ("firmware", "deck"))
+    for type_, group, values in _PARAMETERS
+    for name, value in values.items()
+)
 PARAM_ID = {entry.full_name: index for index, entry in enumerate(PARAM_ENTRIES)}
 
 
@@ -143,11 +112,10 @@ class VariableTable:
     ITEM = 2
 
     def __init__(self, entries: Sequence[VariableEntry], *, log: bool) -> None:
-        self.entries = tuple(entries)
         types = LOG_TYPES if log else PARAM_TYPES
         self._items = [  # as they go over the air: type, group, name
             bytes((types[e.type][0] | (READ_ONLY if e.read_only else 0),)) + f"{e.group}\0{e.name}\0".encode()
-            for e in self.entries
+            for e in entries
         ]
         self.checksum = zlib.crc32(b"".join(self._items))
         self._tail = bytes((16, 128)) if log else b""  # the firmware's room for log blocks and variables
@@ -168,9 +136,10 @@ LOG_TABLE = VariableTable(LOG_ENTRIES, log=True)
 PARAM_TABLE = VariableTable(PARAM_ENTRIES, log=False)
 
 
-def saturate(value: float, form: str) -> float | int:
+def pack_value(value: float, form: str) -> bytes:
     """A value as a variable of this struct format holds it: rounded and kept within its range."""
-    if form in "fe":
-        return float(value)
-    low, high = LOG_LIMITS[form]
-    return min(max(round(value), low), high)
+    if form not in "fe":
+        bits = 8 * struct.calcsize("<" + form)
+        low, high = (0, 2**bits - 1) if form.isupper() else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        value = min(max(round(value), low), high)
+    return struct.pack("<" + form, value)

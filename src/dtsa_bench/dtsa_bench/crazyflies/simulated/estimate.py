@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from .crtp import LOG_ENTRIES
 from .firmware import Firmware
 from .planner import IDLE, Triple
 
@@ -12,6 +13,9 @@ GRAVITY = 9.81
 VARIANCE_RESET = 1.0  # m^2, right after the estimator was reset
 VARIANCE_REST = 2e-5  # m^2, once it has converged
 CONVERGE_S = 0.08  # s, time constant
+LOW_V = 3.2
+RSSI = 42  # -dBm
+_NAMES = [entry.full_name for entry in LOG_ENTRIES]
 
 
 @dataclass(slots=True)
@@ -78,46 +82,25 @@ def compress(q: tuple[float, float, float, float]) -> int:
 
 def log_values(estimate: Estimate, firmware: Firmware, t: float) -> dict[str, float]:
     """All log variables at time t, by their full names, in the firmware's units."""
-    x, y, z = estimate.position
-    vx, vy, vz = estimate.velocity
     roll, pitch = attitude(estimate.acceleration, firmware.yaw)
-    supervisor, cell = firmware.supervisor, firmware.battery
-    variance = estimate.variance(t)
+    supervisor, battery, setpoint = firmware.supervisor, firmware.battery, firmware.setpoint
     info = supervisor.info(
         planner_active=firmware.planner.state != IDLE, trajectory_finished=firmware.planner.finished(t)
     )
-    rate = firmware.setpoint.yaw_rate if firmware.setpoint is not None else 0.0
-    degrees = math.degrees
-    return {
-        "stateEstimateZ.x": x * 1000,
-        "stateEstimateZ.y": y * 1000,
-        "stateEstimateZ.z": z * 1000,
-        "stateEstimateZ.vx": vx * 1000,
-        "stateEstimateZ.vy": vy * 1000,
-        "stateEstimateZ.vz": vz * 1000,
-        "stateEstimateZ.quat": compress(quaternion(roll, pitch, firmware.yaw)),
-        "stateEstimateZ.rateRoll": 0.0,
-        "stateEstimateZ.ratePitch": 0.0,
-        "stateEstimateZ.rateYaw": rate * 1000,
-        "stateEstimate.x": x,
-        "stateEstimate.y": y,
-        "stateEstimate.z": z,
-        "stateEstimate.vx": vx,
-        "stateEstimate.vy": vy,
-        "stateEstimate.vz": vz,
-        "stateEstimate.roll": degrees(roll),
-        "stateEstimate.pitch": -degrees(pitch),  # the firmware's log shows pitch with the opposite sign
-        "stateEstimate.yaw": degrees(firmware.yaw),
-        "pm.vbatMV": cell.voltage * 1000,
-        "pm.vbat": cell.voltage,
-        "pm.state": 3 if cell.voltage < 3.2 else 0,
-        "pm.batteryLevel": min(100, max(0, cell.charge * 100)),
-        "supervisor.info": info,
-        "sys.canfly": supervisor.motors_allowed,
-        "sys.isFlying": supervisor.flying,
-        "sys.isTumbled": supervisor.tumbled,
-        "kalman.varPX": variance,
-        "kalman.varPY": variance,
-        "kalman.varPZ": variance,
-        "radio.rssi": 42,
-    }
+    values = (  # in the order of LOG_ENTRIES
+        *(1000 * v for v in (*estimate.position, *estimate.velocity)),
+        compress(quaternion(roll, pitch, firmware.yaw)),
+        *(0.0, 0.0, 1000 * setpoint.yaw_rate if setpoint is not None else 0.0),
+        *estimate.position,
+        *estimate.velocity,
+        # The firmware's log shows pitch with the opposite sign.
+        *map(math.degrees, (roll, -pitch, firmware.yaw)),
+        *(battery.voltage * 1000, battery.voltage),
+        3 if battery.voltage < LOW_V else 0,
+        min(100, max(0, battery.charge * 100)),
+        info,
+        *(supervisor.motors_allowed, supervisor.flying, supervisor.tumbled),
+        *(estimate.variance(t),) * 3,
+        RSSI,
+    )
+    return dict(zip(_NAMES, values, strict=True))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from dtsa_agent.crazyflie.state import decompress_quaternion, yaw_of
 
-from .planner import DISABLED, Goal, Planner, Triple
+from .planner import DISABLED, FLYING, IDLE, LANDING, Goal, Planner, Triple
 from .supervisor import LEVEL_OUT, FirmwareSupervisor
 
 # What the vehicle does during a step.
@@ -25,7 +25,7 @@ FLY = "fly"  # follows a velocity command
 LEVEL = "level"  # attitude level: drifts on, only drag slows it down; height is still controlled
 
 POSITION_GAIN = 2.0  # 1/s
-PRIORITY_NONE, PRIORITY_LOWEST, PRIORITY_HIGH_LEVEL, PRIORITY_STREAM = 0, 1, 1, 2  # an app's may be higher
+PRIORITY_NONE, PRIORITY_HIGH_LEVEL, PRIORITY_STREAM = 0, 1, 2  # an app's may be higher
 
 # Of the battery, a single lithium cell.
 FULL_V = 4.15
@@ -70,38 +70,29 @@ class FirmwareSetpoint:
     motors: bool = True
 
 
-def _decode_position(data: bytes, t: float) -> FirmwareSetpoint:
-    x, y, z, yaw = struct.unpack_from("<4f", data)
-    return FirmwareSetpoint(t, position=(x, y, z), yaw=math.radians(yaw))
+# Length of a packet on the generic commander's port, by its type: stop, full state, position, velocity, hover. 8 and 10
+# count yaw rates as usual; the older 1 and 5 have the opposite sign and are not sent to protocol version 9 and later.
+LENGTHS = {0: 1, 6: 29, 7: 17, 8: 17, 10: 17}
 
 
-def _decode_velocity(data: bytes, t: float) -> FirmwareSetpoint:
-    x, y, z, rate = struct.unpack_from("<4f", data)
-    return FirmwareSetpoint(t, velocity=(x, y, z), yaw_rate=math.radians(rate))
-
-
-def _decode_hover(data: bytes, t: float) -> FirmwareSetpoint:
-    vx, vy, rate, height = struct.unpack_from("<4f", data)
-    return FirmwareSetpoint(t, body_velocity=(vx, vy), height=height, yaw_rate=math.radians(rate))
-
-
-def _decode_full_state(data: bytes, t: float) -> FirmwareSetpoint:
-    values = struct.unpack_from("<9hI3h", data)
-    position, velocity, acceleration = (
-        (values[i] / 1000, values[i + 1] / 1000, values[i + 2] / 1000) for i in (0, 3, 6)
-    )
-    yaw = yaw_of(decompress_quaternion(values[9]))
-    return FirmwareSetpoint(t, position, velocity, acceleration, yaw=yaw, yaw_rate=values[12] / 1000)
-
-
-# Type byte of a packet on the generic commander's port -> decoder. 8 and 10 count yaw rates as usual; the
-# older 1 and 5 have the opposite sign and are not sent to protocol version 9 and later.
-DECODERS: dict[int, tuple[int, Callable[[bytes, float], FirmwareSetpoint]]] = {
-    6: (28, _decode_full_state),
-    7: (16, _decode_position),
-    8: (16, _decode_velocity),
-    10: (16, _decode_hover),
-}
+def decode_setpoint(data: bytes, t: float) -> FirmwareSetpoint:
+    """The setpoint of such a packet that came at t (s)."""
+    kind = data[0]
+    if kind == 0:
+        return FirmwareSetpoint(t, motors=False)
+    if kind == 6:
+        values = struct.unpack_from("<9hI3h", data, 1)
+        position, velocity, acceleration = (
+            (values[i] / 1000, values[i + 1] / 1000, values[i + 2] / 1000) for i in (0, 3, 6)
+        )
+        yaw = yaw_of(decompress_quaternion(values[9]))
+        return FirmwareSetpoint(t, position, velocity, acceleration, yaw=yaw, yaw_rate=values[12] / 1000)
+    a, b, c, d = struct.unpack_from("<4f", data, 1)
+    if kind == 7:
+        return FirmwareSetpoint(t, position=(a, b, c), yaw=math.radians(d))
+    if kind == 8:
+        return FirmwareSetpoint(t, velocity=(a, b, c), yaw_rate=math.radians(d))
+    return FirmwareSetpoint(t, body_velocity=(a, b), height=d, yaw_rate=math.radians(c))
 
 
 class Firmware:
@@ -124,7 +115,7 @@ class Firmware:
         self.groups = 0  # a bit each
         self.battery = Battery()
         self.setpoint: FirmwareSetpoint | None = None
-        self._priority = PRIORITY_NONE
+        self.priority = PRIORITY_NONE  # of the source whose setpoint counts
         self._streaming = False
         self._here = Goal()  # where a path would begin: on the present path, or where the vehicle is
         self.yaw = 0.0
@@ -132,35 +123,22 @@ class Firmware:
     # -- commands from the radio ------------------------------------------------------------------------------------
     def stream(self, data: bytes, t: float) -> None:
         """A packet of the generic commander: a streamed setpoint."""
-        kind = data[0] if data else -1
-        if kind == 0:
-            self._accept(FirmwareSetpoint(t, motors=False))
-        elif kind in DECODERS and len(data) > DECODERS[kind][0]:
-            self._accept(DECODERS[kind][1](data[1:], t))
+        if data and len(data) >= LENGTHS.get(data[0], math.inf):
+            self.offer(decode_setpoint(data, t), PRIORITY_STREAM)
 
     def manual(self, data: bytes, t: float) -> None:
         """Roll, pitch, yaw rate, thrust: only thrust 0 (stop) and level flight are modelled."""
-        if len(data) < 14:
-            return
         *_, thrust = struct.unpack_from("<3fH", data)
-        self._accept(FirmwareSetpoint(t, velocity=(0.0, 0.0, 0.0), motors=thrust > 0))
-
-    @property
-    def priority(self) -> int:
-        """Priority of the source whose setpoint counts."""
-        return self._priority
-
-    def _accept(self, setpoint: FirmwareSetpoint) -> None:
-        self.offer(setpoint, PRIORITY_STREAM)
+        self.offer(FirmwareSetpoint(t, velocity=(0.0, 0.0, 0.0), motors=thrust > 0), PRIORITY_STREAM)
 
     def offer(self, setpoint: FirmwareSetpoint, priority: int) -> bool:
         """Accept a setpoint from a source of this priority; False: one of a higher priority counts."""
-        if priority < self._priority:
+        if priority < self.priority:
             return False
-        self._priority = priority
+        self.priority = priority
         self.setpoint = setpoint
         if priority > PRIORITY_HIGH_LEVEL:
-            self.planner.stop()
+            self.planner.state = IDLE
             if not self._streaming:
                 self._streaming = True
                 self._report("streaming")
@@ -168,8 +146,8 @@ class Firmware:
 
     def notify_stop(self) -> None:
         """The stream of setpoints is over: high-level commands count again."""
-        if self._priority > PRIORITY_HIGH_LEVEL:
-            self._priority = PRIORITY_LOWEST
+        if self.priority > PRIORITY_HIGH_LEVEL:
+            self.priority = PRIORITY_HIGH_LEVEL
             self._streaming = False
             self._report("stream ended")
 
@@ -184,23 +162,25 @@ class Firmware:
         if data[1] and not data[1] & self.groups:
             return 0
         if kind == 3:
-            self.planner.stop()
+            self.planner.state = IDLE
             self._report("high-level stop")
             return 0
-        here = self._here
+        here, state = self._here, self.planner.state
         if kind == 12:
             _, relative, _, x, y, z, yaw, duration = struct.unpack_from("<B??5f", data, 1)
             if relative:
                 x, y, z = (a + b for a, b in zip((x, y, z), here.position, strict=True))
                 yaw += self.yaw
-            self.planner.go_to(t, here, (x, y, z), yaw, duration)
+            self.planner.plan(FLYING, t, here, (x, y, z), yaw, duration)
             self._report("go_to", goal=[round(v, 3) for v in (x, y, z)])
             return 0
         _, height, yaw, keep_yaw, duration = struct.unpack_from("<Bff?f", data, 1)
-        name, order = ("takeoff", self.planner.takeoff) if kind == 7 else ("land", self.planner.land)
-        if not order(t, here, height, self.yaw if keep_yaw else yaw, duration):
+        takes_off = kind == 7
+        if state != IDLE if takes_off else state == LANDING:
             return 1
-        self._report(name, height=round(height, 3))
+        place, yaw = (*here.position[:2], height), self.yaw if keep_yaw else yaw
+        self.planner.plan(FLYING if takes_off else LANDING, t, Goal(here.position), place, yaw, duration)  # from rest
+        self._report("takeoff" if takes_off else "land", height=round(height, 3))
         return 0
 
     # -- one step of control ----------------------------------------------------------------------------------------
@@ -208,11 +188,14 @@ class Firmware:
         """What the vehicle does from t to t + dt by its estimate: OFF, FLY or LEVEL, and the velocity command, m/s."""
         allowed = self.supervisor.motors_allowed
         if not allowed:
-            self.planner.stop()
+            self.planner.state = IDLE
         goal = self.planner.goal(t)
         self._here = goal or Goal(position, velocity, yaw=self.yaw)
-        if allowed and self._priority <= PRIORITY_HIGH_LEVEL and self.planner.state != DISABLED:
-            self._follow_planner(t, goal)
+        if allowed and self.priority <= PRIORITY_HIGH_LEVEL and self.planner.state != DISABLED:
+            self.priority = PRIORITY_HIGH_LEVEL
+            self.setpoint = FirmwareSetpoint(t, motors=False)  # if it has nothing to fly
+            if goal is not None:
+                self.setpoint = FirmwareSetpoint(t, goal.position, goal.velocity, goal.acceleration, yaw=goal.yaw)
         setpoint = self.setpoint if allowed else None
         thrust = setpoint is not None and setpoint.motors
         age = math.inf if setpoint is None else t - setpoint.time
@@ -220,18 +203,7 @@ class Firmware:
         self.battery.update(dt, motors=thrust)
         if not (thrust and self.supervisor.motors_allowed) or setpoint is None:
             return OFF, (0.0, 0.0, 0.0)
-        command = self._velocity(setpoint, position, dt)
-        if self.supervisor.state == LEVEL_OUT:
-            return LEVEL, command
-        return FLY, command
-
-    def _follow_planner(self, t: float, goal: Goal | None) -> None:
-        """The high-level commander's setpoint: where to be, or motors off if it has nothing to fly."""
-        self._priority = PRIORITY_HIGH_LEVEL
-        if goal is None:
-            self.setpoint = FirmwareSetpoint(t, motors=False)
-        else:
-            self.setpoint = FirmwareSetpoint(t, goal.position, goal.velocity, goal.acceleration, yaw=goal.yaw)
+        return LEVEL if self.supervisor.state == LEVEL_OUT else FLY, self._velocity(setpoint, position, dt)
 
     def _velocity(self, s: FirmwareSetpoint, position: Triple, dt: float) -> Triple:
         if s.yaw is not None:

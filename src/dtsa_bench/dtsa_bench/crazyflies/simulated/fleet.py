@@ -12,20 +12,20 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.crazyflies.simulated.radio.side import RadioHost, RadioServer
+from dtsa_bench.crazyflies.simulated.radio.side import RadioServer
 
 from .fleet_config import HOST, FleetConfig
 from .motion import TICK_S, FleetMotion
 from .peer import CrtpPeer
-from .process import check_fault
+from .process import NUMBERS, check_fault
 from .truth import TruthLog
 
-NUMBERS = ("rate", "direction", "voltage", "distance", "dongle", "seconds")
 MAX_LAG_S = 0.5  # a machine that lags further behind skips time, and the record says so
 
 
@@ -33,7 +33,7 @@ MAX_LAG_S = 0.5  # a machine that lags further behind skips time, and the record
 class _Link:
     """Socket and link faults of one vehicle."""
 
-    socket: socket.socket | None
+    socket: socket.socket | None = None  # None: a radio's, or closed by a fault
     host: tuple[str, int] | None = None  # of the last datagram
     drop_up: float = 0.0
     drop_down: float = 0.0
@@ -44,7 +44,7 @@ class _Link:
 class Fleet:
     """The fleet. `run()` flies it until `stop()` is called from anywhere; `shown` is called after each step.
 
-    :raises ConfigError: a port is in use.
+    :raises ConfigError: a port is in use, or a file cannot be written.
     """
 
     def __init__(self, config: FleetConfig) -> None:
@@ -52,22 +52,21 @@ class Fleet:
         # epoll waits in whole milliseconds, which are long on the air.
         self._selector = selectors.SelectSelector() if config.radio.path is not None else selectors.DefaultSelector()
         self.radio: RadioServer | None = None
-        self._links: list[_Link] = []
-        self._control: socket.socket | None = None
-        self._open_sockets()
+        self._links = [_Link() for _ in range(config.count)]
+        self._loss = np.random.default_rng(np.random.SeedSequence(config.seed).spawn(3)[1])
         header = {
-            "count": config.count,
-            "uris": config.uris,
-            "seed": config.seed,
-            "protocol": config.protocol,
-            "start": np.asarray(config.start).tolist(),
-            "unix_time": time.time(),
-        }
+            "count": config.count, "uris": config.uris, "seed": config.seed, "protocol": config.protocol,
+            "start": np.asarray(config.start).tolist(), "unix_time": time.time(),
+        }  # fmt: skip
         try:
+            self._open_sockets()
             self.truth = TruthLog(config.truth, header)
         except OSError as error:
             self.close()
             raise ConfigError("truth", str(config.truth), f"a file that can be written ({error.strerror})") from error
+        except ConfigError:
+            self.close()
+            raise
         self.tick = 0
         self.motion = FleetMotion(config, self._report)
         self.vehicles, self.firmware, self.estimates = self.motion.vehicles, self.motion.firmware, self.motion.estimates
@@ -75,46 +74,40 @@ class Fleet:
             CrtpPeer(f, e, config.protocol, k)
             for k, (f, e) in enumerate(zip(self.firmware, self.estimates, strict=True), 1)
         ]
-        self._loss = np.random.default_rng(np.random.SeedSequence(config.seed).spawn(3)[1])
         self._running = True
         self.shown: Callable[[], None] = lambda: None
 
     # -- life cycle -------------------------------------------------------------------------------------------------
-    def _bind(self, port: int) -> socket.socket:
+    def _bind(self, port: int, serve: Callable[[], None]) -> socket.socket:
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         sock.setblocking(False)
         try:
             sock.bind((HOST, port))
         except OSError as error:
             sock.close()
-            self.close()
             raise ConfigError("port", port, f"a free UDP port ({error.strerror})") from error
+        self._selector.register(sock, selectors.EVENT_READ, serve)
         return sock
+
+    def _bind_link(self, index: int) -> None:
+        self._links[index].socket = self._bind(self.config.base_port + index, partial(self._serve_link, index))
 
     def _open_sockets(self) -> None:
         if self.config.radio.path is not None:
-            self.radio = RadioServer(self.config.radio, self._hear, self._passes)
-            self._selector.register(self.radio.listener, selectors.EVENT_READ, self.radio)
-            self._links = [_Link(None) for _ in range(self.config.count)]
-        for k in range(0 if self.radio else self.config.count):
-            sock = self._bind(self.config.base_port + k)
-            self._links.append(_Link(sock))
-            self._selector.register(sock, selectors.EVENT_READ, k)
-        self._control = self._bind(self.config.control_port)
-        self._selector.register(self._control, selectors.EVENT_READ, -1)
+            self.radio = RadioServer(self.config.radio, self._receive, self._passes)
+            self.radio.listen(self._selector)
+        else:
+            for index in range(self.config.count):
+                self._bind_link(index)
+        if self.config.count:
+            self._control = self._bind(self.config.control_port, self._serve_control)
 
     def close(self) -> None:
         """Release the ports and end the record."""
-        for link in self._links:
-            if link.socket is not None:
-                link.socket.close()
-                link.socket = None
-        if self._control is not None:
-            self._control.close()
-            self._control = None
         if self.radio is not None:
             self.radio.close()
-            self.radio = None
+        for key in list((self._selector.get_map() or {}).values()):
+            key.fileobj.close()  # type: ignore[union-attr]
         self._selector.close()
         if hasattr(self, "truth"):
             self.truth.close()
@@ -164,77 +157,53 @@ class Fleet:
 
     # -- links ------------------------------------------------------------------------------------------------------
     def _serve(self, timeout: float) -> None:
-        if self.radio is not None:
-            due = self.radio.wait_s()
-            timeout = timeout if due is None else min(timeout, due)
-        for key, _ in self._selector.select(timeout):
-            if isinstance(key.data, (RadioServer, RadioHost)):
-                assert self.radio is not None
-                self.radio.serve_host(key.data if isinstance(key.data, RadioHost) else None, self._selector)
-                continue
-            if key.data < 0:
-                self._serve_control()
-                continue
-            sock = self._links[key.data].socket
-            while sock is not None:
-                try:
-                    datagram, host = sock.recvfrom(256)
-                except (BlockingIOError, ConnectionError):
-                    break
-                self._receive(key.data, datagram, host)
+        for key, _ in self._selector.select(timeout if self.radio is None else self.radio.wait_s(timeout)):
+            key.data()
         if self.radio is not None:
             self.radio.run()
 
+    def _serve_link(self, index: int) -> None:
+        link = self._links[index]
+        while link.socket is not None:
+            try:
+                datagram, host = link.socket.recvfrom(256)
+            except (BlockingIOError, ConnectionError):
+                break
+            if self._passes(index, True):
+                link.host = host
+                self._receive(index, datagram)
+
     def _passes(self, index: int, up: bool) -> bool:
-        """Whether a packet on the air passes the faults of a vehicle's link."""
+        """Whether a packet passes the faults of a vehicle's link."""
         link = self._links[index]
         rate = link.drop_up if up else link.drop_down
         return not link.frozen and not (rate and self._loss.random() < rate)
 
-    def _hear(self, index: int, packet: bytes, t: float) -> None:
+    def _receive(self, index: int, packet: bytes, t: float = 0.0) -> None:
         reply = self.peers[index].receive(packet, self.time)
-        if reply is not None and self.radio is not None:
-            self.radio.receivers[index].push(reply)
-
-    def _receive(self, index: int, datagram: bytes, host: tuple[str, int]) -> None:
-        link = self._links[index]
-        if link.frozen or (link.drop_up and self._loss.random() < link.drop_up):
-            return
-        link.host = host
-        reply = self.peers[index].receive(datagram, self.time)
         if reply is not None:
-            self._send(link, reply)
+            self._send(index, reply)
 
-    def _send(self, link: _Link, datagram: bytes) -> None:
-        if link.socket is None or link.host is None or link.frozen:
-            return
-        if link.drop_down and self._loss.random() < link.drop_down:
-            return
-        # A host that has gone, or a full buffer: the packet is lost, as on the air.
-        with contextlib.suppress(OSError):
-            link.socket.sendto(datagram, link.host)
+    def _send(self, index: int, packet: bytes) -> None:
+        link = self._links[index]
+        if self.radio is not None:
+            self.radio.receivers[index].push(packet)
+        elif link.socket is not None and link.host is not None and self._passes(index, False):
+            # A host that has gone, or a full buffer: the packet is lost, as on the air.
+            with contextlib.suppress(OSError):
+                link.socket.sendto(packet, link.host)
 
     def _send_logs(self) -> None:
-        if self.radio is not None:
-            now = self.radio.now_ns() / 1e9
-            for peer, receiver in zip(self.peers, self.radio.receivers, strict=True):
-                packets = list(peer.log_packets(self.tick, self.time)) if peer.blocks else ()
-                if packets and not receiver.connected(now):  # no host is there: the log ends
-                    peer.blocks.clear()
-                    receiver.clear()
-                else:
-                    for packet in packets:
-                        receiver.push(packet)
-            return
-        for peer, link in zip(self.peers, self._links, strict=True):
-            if peer.blocks and link.host is not None:
-                for datagram in peer.log_packets(self.tick, self.time):
-                    self._send(link, datagram)
+        for index, peer in enumerate(self.peers):
+            packets = list(peer.log_packets(self.tick, self.time)) if peer.blocks else ()
+            if packets and self.radio and not self.radio.receivers[index].connected(self.radio.now_ns() / 1e9):
+                peer.blocks.clear()  # no host is there: the log ends
+                continue
+            for packet in packets:
+                self._send(index, packet)
 
     # -- faults -----------------------------------------------------------------------------------------------------
     def _serve_control(self) -> None:
-        if self._control is None:
-            return
         try:
             data, host = self._control.recvfrom(2048)
         except (BlockingIOError, ConnectionError):
@@ -247,7 +216,7 @@ class Fleet:
             answer: dict[str, Any] = {"ok": True, "t": self.time}
         except ConfigError as error:
             answer = {"ok": False, "field": error.field, "value": error.value, "allowed": error.allowed}
-        except ValueError:
+        except (ValueError, RecursionError):
             answer = {"ok": False, "field": "request", "value": data[:40].decode("ascii", "replace")}
             answer["allowed"] = "a JSON object"
         with contextlib.suppress(OSError):
@@ -263,30 +232,29 @@ class Fleet:
 
     def _apply(self, name: str, index: int, request: dict[str, Any]) -> None:
         link, firmware = self._links[index], self.firmware[index]
-        numbers = {key: value for key, value in request.items() if key in NUMBERS}
+        supervisor = firmware.supervisor
+        numbers = {key: value for key, value in request.items() if key in (*NUMBERS, "direction")}
         self._report(index, f"fault: {name}", **numbers)
         if name == "drop":
             rate, direction = request.get("rate", 1.0), request.get("direction", "both")
             link.drop_up = rate if direction in ("up", "both") else link.drop_up
             link.drop_down = rate if direction in ("down", "both") else link.drop_down
-        elif name == "freeze":
+        elif name == "freeze" or (name == "close" and self.radio is not None):  # on the air nothing bounces
             link.frozen = True
-        elif name == "close" and self.radio is not None:
-            link.frozen = True  # on the air nothing bounces
         elif name == "close" and link.socket is not None:
             self._selector.unregister(link.socket)
             link.socket.close()
             link.socket = None
         elif name == "refuse_arming":
-            firmware.supervisor.refuse_arming = True
+            supervisor.refuse_arming = True
         elif name == "tumble":
-            firmware.supervisor.tumbled = True
+            supervisor.tumbled = True
         elif name == "estimate_jump":
             self.estimates[index].offset = (request.get("distance", 2.0), 0.0, 0.0)
         elif name == "estimate_freeze":
             self.estimates[index].frozen = True
         elif name == "battery":
-            motors = firmware.supervisor.motors_allowed and firmware.supervisor.flying
+            motors = supervisor.motors_allowed and supervisor.flying
             firmware.battery.force(request.get("voltage", 3.0), motors=motors)
         elif name == "unplug" and self.radio is not None:
             self.radio.unplug(request.get("dongle", 0))
@@ -299,15 +267,11 @@ class Fleet:
                     self.radio.receivers[index].reset()
 
     def _heal(self, index: int) -> None:
-        link = self._links[index]
-        link.drop_up = link.drop_down = 0.0
-        link.frozen = False
-        link.heal_at = None
+        link, estimate, supervisor = self._links[index], self.estimates[index], self.firmware[index].supervisor
+        link.drop_up, link.drop_down, link.frozen, link.heal_at = 0.0, 0.0, False, None
+        estimate.offset, estimate.frozen = (0.0, 0.0, 0.0), False
+        supervisor.refuse_arming = supervisor.tumbled = False
         if self.radio is not None:
             self.radio.plug_in()
-        if link.socket is None and self.radio is None:
-            link.socket = self._bind(self.config.base_port + index)
-            self._selector.register(link.socket, selectors.EVENT_READ, index)
-        self.estimates[index].offset, self.estimates[index].frozen = (0.0, 0.0, 0.0), False
-        self.firmware[index].supervisor.refuse_arming = False
-        self.firmware[index].supervisor.tumbled = False
+        elif link.socket is None:
+            self._bind_link(index)

@@ -18,36 +18,13 @@ from .peer import PROTOCOLS
 
 MAX_COUNT = 200
 HOST = "127.0.0.1"
-LAYOUTS = ("ellipse", "grid", "line")
 DEVICES = {"pa": 0x0301, "2": 0x0504}  # Crazyradio PA, Crazyradio 2.0: version of the firmware as USB says it
 
 
-def start_positions(layout: str, count: int, half_axes: tuple[float, float] = (1.2, 2.0)) -> NDArray[np.float64]:
-    """Start positions on the floor, (3, count), m, world; an ellipse counter-clockwise from the x axis, by ids.
-
-    :raises ConfigError: unknown layout.
-    """
-    a, b = half_axes
-    result = np.zeros((3, count))
-    index = np.arange(count)
-    if layout == "ellipse":
-        angle = 2 * math.pi * index / count
-        result[0], result[1] = a * np.cos(angle), b * np.sin(angle)
-    elif layout == "grid":
-        columns = max(1, math.ceil(math.sqrt(count * a / b)))
-        result[0] = _spread(index % columns, columns, a)
-        result[1] = _spread(index // columns, math.ceil(count / columns), b)
-    elif layout == "line":
-        result[1] = _spread(index, count, b)
-    else:
-        raise ConfigError("layout", layout, "one of " + ", ".join(LAYOUTS))
-    return result
-
-
-def _spread(index: NDArray[np.int64], number: int, half: float) -> NDArray[np.float64]:
-    if number == 1:
-        return np.zeros(len(index))
-    return np.asarray(half * (2 * index / (number - 1) - 1), dtype=np.float64)
+def ellipse_positions(count: int, half_x_m: float = 1.2, half_y_m: float = 2.0) -> NDArray[np.float64]:
+    """Start positions on the floor, (3, count), m, world: counter-clockwise from the x axis, by ids."""
+    angle = 2 * math.pi * np.arange(count) / max(count, 1)
+    return np.array([half_x_m * np.cos(angle), half_y_m * np.sin(angle), np.zeros(count)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +81,7 @@ class FleetConfig(Settings):
     :param radio: simulated radios in place of UDP; without a path: UDP.
     """
 
-    count: int = setting(12, "number of vehicles", minimum=1, maximum=MAX_COUNT)
+    count: int = setting(12, "number of vehicles", minimum=0, maximum=MAX_COUNT)
     base_port: int = setting(19850, "UDP port of the first; vehicle k listens on base_port + k - 1", minimum=1024,
                              maximum=65535)  # fmt: skip
     control_port: int = setting(0, "UDP port for faults; 0: base_port - 1", minimum=0, maximum=65535)
@@ -126,9 +103,11 @@ class FleetConfig(Settings):
         check(self)
         if self.base_port > 65536 - self.count:
             raise ConfigError("base_port", self.base_port, f"1024 to {65536 - self.count} for {self.count} vehicles")
+        if not self.count and self.radio.path is None:
+            raise ConfigError("count", self.count, f"1 to {MAX_COUNT}")
         flight_model(self.model)
         if self.start is None:
-            object.__setattr__(self, "start", start_positions("ellipse", self.count))
+            object.__setattr__(self, "start", ellipse_positions(self.count))
         elif np.shape(self.start) != (3, self.count):
             raise ConfigError("start", np.shape(self.start), f"an array of shape (3, {self.count})")
         if not self.control_port:

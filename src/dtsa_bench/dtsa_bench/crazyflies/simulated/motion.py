@@ -37,8 +37,7 @@ class Vehicles:
         """Move all for dt seconds by modes and velocity commands, m/s; the indices of those that hit the floor hard."""
         p, v = self.position, self.velocity
         before = v.copy()
-        off = np.array([mode == OFF for mode in modes])
-        level = np.array([mode == LEVEL for mode in modes])
+        off, level = (np.array([mode == kind for mode in modes], dtype=np.bool_) for kind in (OFF, LEVEL))
         # Level: a = -v / DRAG_S in the plane, written as the command that makes the vehicle model do so.
         command[:2, level] = v[:2, level] * (1.0 - self.model.tau / DRAG_S)
         fallen_p = p[:, off] + v[:, off] * dt

@@ -7,7 +7,6 @@ import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from . import crtp
 from .estimate import Estimate, log_values
@@ -30,22 +29,17 @@ class LogBlock:
     def size(self) -> int:
         return struct.calcsize("<" + "".join(form for _, form in self.variables))
 
-    def data(self, values: dict[str, float]) -> bytes:
-        return b"".join(struct.pack("<" + form, crtp.saturate(values[name], form)) for name, form in self.variables)
 
-
-class OnboardApp(Protocol):
-    """An app on board: it adds parameters and log variables, and gets packets of the app channel."""
+@dataclass(frozen=True, slots=True)
+class OnboardApp:
+    """An app on board: it adds parameters and log variables, and receives packets of the app channel."""
 
     parameters: Sequence[crtp.VariableEntry]
     logs: Sequence[crtp.VariableEntry]
     receive: Callable[[bytes], object]
-
-    def parameter(self, name: str) -> float: ...
-
-    def set_parameter(self, name: str, value: float) -> None: ...
-
-    def log_values(self) -> Mapping[str, float]: ...
+    get_parameter: Callable[[str], float]
+    set_parameter: Callable[[str, float], None]
+    log_values: Callable[[], Mapping[str, float]]
 
 
 class CrtpPeer:
@@ -57,7 +51,6 @@ class CrtpPeer:
     def __init__(self, firmware: Firmware, estimate: Estimate, protocol: int = 12, number: int = 1) -> None:
         self.firmware = firmware
         self.estimate = estimate
-        self.protocol = protocol
         self.number = number
         self.positions_received = 0
         self.blocks: dict[int, LogBlock] = {}
@@ -70,21 +63,21 @@ class CrtpPeer:
             (crtp.LINK, 1): lambda data, t: b"Bitcraze Crazyflie".ljust(30, b"\0"),
             (crtp.LINK, 3): lambda data, t: data,
             (crtp.PLATFORM, 0): self._platform,
-            (crtp.PLATFORM, 1): lambda data, t: bytes((0, self.protocol)) if data[:1] == b"\0" else None,
+            (crtp.PLATFORM, 1): lambda data, t: bytes((0, protocol)) if data[0] == 0 else None,
             (crtp.PLATFORM, 2): self._app_channel,
             (crtp.LOG, 0): lambda data, t: self._log_table.answer(data),
             (crtp.LOG, 1): self._log_settings,
             (crtp.PARAM, 0): lambda data, t: self._param_table.answer(data),
             (crtp.PARAM, 1): self._param_read,
             (crtp.PARAM, 2): self._param_write,
-            (crtp.PARAM, 3): self._param_misc,
-            (crtp.MEMORY, 0): lambda data, t: b"\x01\0" if data[:1] == b"\x01" else None,  # there are none
+            (crtp.PARAM, 3): self._param_default,
+            (crtp.MEMORY, 0): lambda data, t: b"\x01\0" if data[0] == 1 else None,  # there are none
             (crtp.COMMANDER, 0): lambda data, t: self.firmware.manual(data, t),
-            (crtp.LOCALIZATION, 0): self._ext_position,
+            (crtp.LOCALIZATION, 0): lambda data, t: self._positioned(struct.unpack_from("<3f", data)),
             (crtp.LOCALIZATION, 1): self._localization,
-            (crtp.LOCALIZATION, 2): self._ext_positions,
+            (crtp.LOCALIZATION, 2): lambda data, t: self._packed_positions("<B3h", data),
             (crtp.GENERIC_COMMANDER, 0): lambda data, t: self.firmware.stream(data, t),
-            (crtp.GENERIC_COMMANDER, 1): self._meta,
+            (crtp.GENERIC_COMMANDER, 1): lambda data, t: None if data[0] else self.firmware.notify_stop(),
             (crtp.HIGH_LEVEL, 0): lambda data, t: data[:3] + bytes((self.firmware.high_level(data, t),)),
         }
         if protocol >= 12:
@@ -101,10 +94,8 @@ class CrtpPeer:
         self._app = app
         self._params = (*crtp.PARAM_ENTRIES, *app.parameters)
         self._logs = (*crtp.LOG_ENTRIES, *app.logs)
-        self._param_table, self._log_table = (
-            crtp.VariableTable(self._params, log=False),
-            crtp.VariableTable(self._logs, log=True),
-        )
+        self._param_table = crtp.VariableTable(self._params, log=False)
+        self._log_table = crtp.VariableTable(self._logs, log=True)
         self.values[len(crtp.PARAM_ENTRIES) :] = [entry.value for entry in app.parameters]
 
     def receive(self, datagram: bytes, t: float) -> bytes | None:
@@ -131,64 +122,57 @@ class CrtpPeer:
                 values.update(self._app.log_values())
             stamp = (int(t * 1000) & 0xFFFFFF).to_bytes(3, "little")
             for number, block in due:
-                yield crtp.pack(crtp.LOG, 2, bytes((number,)) + stamp + block.data(values))
+                data = b"".join(crtp.pack_value(values[name], form) for name, form in block.variables)
+                yield crtp.pack(crtp.LOG, 2, bytes((number,)) + stamp + data)
 
+    # -- handlers: request's data and time in, reply's data out -----------------------------------------------------
     def _app_channel(self, data: bytes, t: float) -> None:
         if self._app is not None:
             self._app.receive(data)
 
-    # -- handlers: request's data and time in, reply's data out -----------------------------------------------------
     def _platform(self, data: bytes, t: float) -> bytes | None:
-        if data[:1] == b"\x01" and len(data) > 1:
-            ok = self.firmware.supervisor.request_arming(bool(data[1]))
-            return bytes((1, ok, self.firmware.supervisor.armed))
-        if data[:1] == b"\x02":
-            return bytes((2, self.firmware.supervisor.request_recovery()))
+        supervisor = self.firmware.supervisor
+        if data[0] == 1:
+            return bytes((1, supervisor.request_arming(bool(data[1])), supervisor.armed))
+        if data[0] == 2:
+            recovered = supervisor.request_recovery()
+            return bytes((2, recovered, recovered))
         return None
 
     def _supervisor_info(self, data: bytes, t: float) -> bytes | None:
-        if data[:1] != b"\x0c":
+        if data[0] != 0x0C:
             return None
         info = log_values(self.estimate, self.firmware, t)["supervisor.info"]
         return struct.pack("<BH", 0x8C, int(info))
 
     def _supervisor_command(self, data: bytes, t: float) -> bytes | None:
-        kind = data[0]
-        supervisor = self.firmware.supervisor
-        if kind == 1:
-            ok = supervisor.request_arming(bool(data[1]))
-            return bytes((0x81, ok, supervisor.armed))
-        if kind == 2:
-            ok = supervisor.request_recovery()
-            return bytes((0x82, ok, ok))
-        return self._emergency(kind, t)
+        reply = self._platform(data, t)
+        if reply is not None:
+            return bytes((0x80 | reply[0],)) + reply[1:]
+        return self._emergency(data[0], t)
 
-    def _ext_position(self, data: bytes, t: float) -> None:
-        x, y, z = struct.unpack_from("<3f", data)
-        self._positioned((x, y, z))
-
-    def _ext_positions(self, data: bytes, t: float) -> None:
-        """Up to four places: id and mm of each."""
-        for number, x, y, z in struct.iter_unpack("<B3h", data[: len(data) // 7 * 7]):
-            if number == self.number:
-                self._positioned((x / 1000, y / 1000, z / 1000))
-
-    def _positioned(self, place: tuple[float, float, float]) -> None:
+    def _positioned(self, place: Sequence[float]) -> None:
+        """A position from outside, m, world."""
         self.positions_received += 1
-        if all(map(math.isfinite, place)):
-            self.estimate.correct(place, max(self.values[crtp.PARAM_ID["locSrv.extPosStdDev"]], 1e-4))
+        x, y, z = place
+        if math.isfinite(x + y + z):
+            self.estimate.correct((x, y, z), max(self.values[crtp.PARAM_ID["locSrv.extPosStdDev"]], 1e-4))
+
+    def _packed_positions(self, form: str, data: bytes) -> None:
+        """Places of several: id, mm, and with poses the attitude in 32 bits."""
+        size = struct.calcsize(form)
+        for number, *values in struct.iter_unpack(form, data[: len(data) // size * size]):
+            if number == self.number:
+                self._positioned([value / 1000 for value in values[:3]])
 
     def _localization(self, data: bytes, t: float) -> bytes | None:
-        if data[:1] == b"\x08":
-            x, y, z, *_ = struct.unpack_from("<7f", data, 1)
-            self._positioned((x, y, z))
-            return None
-        if data[:1] == b"\x09":  # up to two poses: id, mm, and the attitude in 32 bits
-            for number, x, y, z, _ in struct.iter_unpack("<B3hI", data[1 : 1 + len(data[1:]) // 11 * 11]):
-                if number == self.number:
-                    self._positioned((x / 1000, y / 1000, z / 1000))
-            return None
-        return self._emergency(data[0] if data else 0, t)
+        if data[0] == 8:
+            self._positioned(struct.unpack_from("<7f", data, 1)[:3])
+        elif data[0] == 9:
+            self._packed_positions("<B3hI", data[1:])
+        else:
+            self._emergency(data[0], t)
+        return None
 
     def _emergency(self, kind: int, t: float) -> None:
         if kind == 3:
@@ -196,36 +180,31 @@ class CrtpPeer:
         elif kind == 4:
             self.firmware.supervisor.watchdog(t)
 
-    def _meta(self, data: bytes, t: float) -> None:
-        if data[:1] == b"\0":
-            self.firmware.notify_stop()
-
     def _log_settings(self, data: bytes, t: float) -> bytes | None:
         command = data[0]
         if command == 5:
             self.blocks.clear()
             return b"\x05\0\0"
         number = data[1]
-        if command in (6, 7):
-            return bytes((command, number, self._log_append(command == 6, number, data[2:])))
-        if command not in (2, 3, 4):
-            return bytes((command, number, errno.ENOEXEC))
         block = self.blocks.get(number)
-        if block is None:
-            return bytes((command, number, errno.ENOENT))
-        if command == 2:
+        error = 0
+        if command not in (2, 3, 4, 6, 7):
+            error = errno.ENOEXEC
+        elif command == 6:
+            error = errno.EEXIST if block is not None else self._log_append(LogBlock(), number, data[2:])
+        elif block is None:
+            error = errno.ENOENT
+        elif command == 7:
+            error = self._log_append(block, number, data[2:])
+        elif command == 2:
             del self.blocks[number]
         else:
             block.period = data[2] if command == 3 else 0
             block.phase = int(t * 100)
-        return bytes((command, number, 0))
+        return bytes((command, number, error))
 
-    def _log_append(self, create: bool, number: int, data: bytes) -> int:
-        if create and number in self.blocks:
-            return errno.EEXIST
-        if not create and number not in self.blocks:
-            return errno.ENOENT
-        block = LogBlock() if create else self.blocks[number]
+    def _log_append(self, block: LogBlock, number: int, data: bytes) -> int:
+        """Add variables to a block; 0, or an error number of the firmware's."""
         variables = list(block.variables)
         for kind, index in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
             form = crtp.LOG_FORMAT_BY_CODE.get(kind & 15)
@@ -238,9 +217,6 @@ class CrtpPeer:
         self.blocks[number] = block
         return 0
 
-    def _param_format(self, index: int) -> str:
-        return "<" + crtp.PARAM_TYPES[self._params[index].type][1]
-
     def _param_read(self, data: bytes, t: float) -> bytes:
         (index,) = struct.unpack_from("<H", data)
         if index >= len(self.values):
@@ -248,27 +224,28 @@ class CrtpPeer:
         return data[:2] + b"\0" + self._packed(index)
 
     def _packed(self, index: int) -> bytes:
-        form = self._param_format(index)
+        entry = self._params[index]
         if self._app is not None and index >= len(crtp.PARAM_ENTRIES):
-            self.values[index] = self._app.parameter(self._params[index].full_name)
-        return struct.pack(form, crtp.saturate(self.values[index], form[1]))
+            self.values[index] = self._app.get_parameter(entry.full_name)
+        return crtp.pack_value(self.values[index], crtp.PARAM_TYPES[entry.type][1])
 
     def _param_write(self, data: bytes, t: float) -> bytes:
         (index,) = struct.unpack_from("<H", data)
         if index >= len(self.values):
             return data[:2] + bytes((errno.ENOENT,))
-        self.set_parameter(index, struct.unpack_from(self._param_format(index), data, 2)[0], t)
+        form = crtp.PARAM_TYPES[self._params[index].type][1]
+        self.set_parameter(index, struct.unpack_from("<" + form, data, 2)[0], t)
         return data[:2] + self._packed(index)
 
-    def _param_misc(self, data: bytes, t: float) -> bytes | None:
-        if data[:1] in (b"\x06", b"\x08"):  # default value
-            (index,) = struct.unpack_from("<H", data, 1)
-            if index >= len(self.values):
-                return data[:3] + bytes((errno.ENOENT,))
-            form = self._param_format(index)
-            default = struct.pack(form, crtp.saturate(self._params[index].value, form[1]))
-            return data[:3] + (b"\0" if data[:1] == b"\x08" else b"") + default
-        return None
+    def _param_default(self, data: bytes, t: float) -> bytes | None:
+        if data[0] not in (6, 8):
+            return None
+        (index,) = struct.unpack_from("<H", data, 1)
+        if index >= len(self.values):
+            return data[:3] + bytes((errno.ENOENT,))
+        entry = self._params[index]
+        default = crtp.pack_value(entry.value, crtp.PARAM_TYPES[entry.type][1])
+        return data[:3] + (b"\0" if data[0] == 8 else b"") + default
 
     def set_parameter(self, index: int, value: float, t: float) -> None:
         """Set a parameter (its index in the table), unless it can only be read."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
@@ -54,76 +55,32 @@ def evaluate(coefficients: tuple[float, ...], t: float) -> Triple:
     return value, speed, acceleration
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedPath:
-    """One flight from here to there."""
-
-    start: float  # s
-    duration: float  # s
-    axes: tuple[tuple[float, ...], ...]  # x, y, z
-    end: Goal
-
-    def goal(self, t: float) -> Goal:
-        """Where it leads at t (s); after its end: the end, at rest."""
-        if t >= self.start + self.duration:
-            return self.end
-        x, y, z = (evaluate(axis, t - self.start) for axis in self.axes)
-        return Goal((x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2]), self.end.yaw)
-
-
 class Planner:
     """Paths between high-level commands. Times (`t`) are s by the fleet's clock; yaw is in rad, world."""
 
     def __init__(self) -> None:
         self.state = IDLE
-        self.path: PlannedPath | None = None
+        self._start = self._end_time = -math.inf  # s
+        self._axes: tuple[tuple[float, ...], ...] = ()  # x, y, z
+        self._end = Goal()
 
-    def stop(self) -> None:
-        """Motors off, and the path is forgotten."""
-        self.state = IDLE
-
-    def disable(self) -> None:
-        """The path is forgotten; nothing is commanded until the next order."""
-        self.state = DISABLED
-
-    def takeoff(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
-        """Climb to `height` (m above the floor) within `duration` (s), from rest; False: only an idle planner does."""
-        if self.state != IDLE:
-            return False
-        self._from_rest(t, here, height, yaw, duration)
-        self.state = FLYING
-        return True
-
-    def land(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
-        """Sink to `height` within `duration`, from rest, then stop the motors; False: it is landing already."""
-        if self.state == LANDING:
-            return False
-        self._from_rest(t, here, height, yaw, duration)
-        self.state = LANDING
-        return True
-
-    def go_to(self, t: float, here: Goal, place: Triple, yaw: float, duration: float) -> None:
-        """Fly to a place within `duration` and hold it, beginning with speed and acceleration as they are."""
-        self._plan(t, here, place, yaw, duration)
-        self.state = FLYING
-
-    def _from_rest(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> None:
-        x, y, _ = here.position
-        self._plan(t, Goal(here.position), (x, y, height), yaw, duration)
-
-    def _plan(self, t: float, here: Goal, place: Triple, yaw: float, duration: float) -> None:
+    def plan(self, state: str, t: float, here: Goal, place: Triple, yaw: float, duration: float) -> None:
+        """Fly from here to a place within `duration` (s), beginning with speed and acceleration as they are."""
         starts = zip(here.position, here.velocity, here.acceleration, place, strict=True)
-        axes = tuple(septic(p, v, a, end, duration) for p, v, a, end in starts)
-        self.path = PlannedPath(t, duration, axes, Goal(place, yaw=yaw))
+        self._axes = tuple(septic(p, v, a, end, duration) for p, v, a, end in starts)
+        self.state, self._start, self._end_time, self._end = state, t, t + duration, Goal(place, yaw=yaw)
 
     def finished(self, t: float) -> bool:
         """True once the last path has been flown (or there is none)."""
-        return self.path is None or t >= self.path.start + self.path.duration
+        return t >= self._end_time
 
     def goal(self, t: float) -> Goal | None:
         """What to hold now; None while idle, which a landing that is over makes it."""
         if self.state == LANDING and self.finished(t):
             self.state = IDLE
-        if self.state in (IDLE, DISABLED) or self.path is None:
+        if self.state in (IDLE, DISABLED):
             return None
-        return self.path.goal(t)
+        if self.finished(t):
+            return self._end
+        x, y, z = (evaluate(axis, t - self._start) for axis in self._axes)
+        return Goal((x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2]), self._end.yaw)

@@ -66,7 +66,7 @@ def running_fleet(words: Sequence[str]) -> Iterator[str]:
     :raises FleetError: if they do not start.
     """
     process = subprocess.Popen(
-        [sys.executable, "-m", "dtsa_bench.crazyflies.simulated.cli", *words, "--quiet"],
+        [sys.executable, "-m", "dtsa_bench", "fake-crazyflie", *words, "--quiet"],
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,
@@ -104,30 +104,30 @@ FAULTS = {
 }
 
 
+NUMBERS = {
+    "rate": (0.0, 1.0), "voltage": (2.0, 4.3), "distance": (-10.0, 10.0), "dongle": (0, 15), "seconds": (0.0, 1e6),
+}  # fmt: skip
+DIRECTIONS = ("up", "down", "both")
+
+
 def check_fault(request: dict[str, Any], count: int) -> tuple[str, list[int]]:
     """Name and indices (from 0) of a request: `fault`, `cf` (an id from 1, a list of ids, "all"), and its own numbers.
 
     :raises ConfigError: it is not understood.
     """
     fault = request.get("fault")
-    if fault not in FAULTS:
+    if not isinstance(fault, str) or fault not in FAULTS:
         raise ConfigError("fault", fault, "one of " + ", ".join(FAULTS))
     cf = request.get("cf", "all")
     ids = list(range(1, count + 1)) if cf == "all" else cf if isinstance(cf, list) else [cf]
     for i in ids:
         if not isinstance(i, int) or isinstance(i, bool) or not 1 <= i <= count:
             raise ConfigError("cf", i, f'1 to {count}, or "all"')
-    for name, low, high in (
-        ("rate", 0.0, 1.0),
-        ("voltage", 2.0, 4.3),
-        ("distance", -10.0, 10.0),
-        ("dongle", 0, 15),
-        ("seconds", 0.0, 1e6),
-    ):
+    for name, (low, high) in NUMBERS.items():
         value = request.get(name)
         if value is not None and not (isinstance(value, (int, float)) and low <= value <= high):
             raise ConfigError(name, value, f"{low:g} to {high:g}")
-    if request.get("direction", "both") not in ("up", "down", "both"):
+    if request.get("direction", "both") not in DIRECTIONS:
         raise ConfigError("direction", request["direction"], "up, down or both")
     return fault, [i - 1 for i in ids]
 

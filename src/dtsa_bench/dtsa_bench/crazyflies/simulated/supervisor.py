@@ -27,9 +27,23 @@ EMERGENCY_WATCHDOG_S = 1.0
 PREFLIGHT_TIMEOUT_S = 30.0  # armed, but not taken off
 LANDING_TIMEOUT_S = 3.0  # landed: disarmed after that long
 
-CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
-IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
-HL_ACTIVE, HL_FINISHED = 256, 512
+# The next state; the first rule that holds counts. States that last for one step only are left out. Not even an
+# emergency stop counts for one that has landed; it does once the motors are off.
+_NEXT: dict[str, tuple[tuple[str, str], ...]] = {
+    NOT_READY: (("emergency", LOCKED), ("upright", CHECKED)),
+    CHECKED: (("emergency", LOCKED), ("tumbled", NOT_READY), ("armed", READY)),
+    READY: (
+        ("emergency", LOCKED), ("tumbled", NOT_READY), ("disarmed", NOT_READY), ("never took off", NOT_READY),
+        ("in the air", FLYING),
+    ),
+    FLYING: (
+        ("no setpoint", LOCKED), ("emergency", LOCKED), ("tumbled", CRASHED), ("disarmed", NOT_READY),
+        ("old setpoint", LEVEL_OUT), ("on the floor", LANDED),
+    ),
+    LEVEL_OUT: (("no setpoint", LOCKED), ("tumbled", LOCKED), ("emergency", LOCKED), ("new setpoint", FLYING)),
+    LANDED: (("disarmed", NOT_READY), ("stood long", NOT_READY), ("in the air", FLYING)),
+    CRASHED: (("recovered", NOT_READY), ("emergency", LOCKED)),
+}  # fmt: skip
 
 
 class FirmwareSupervisor:
@@ -96,41 +110,22 @@ class FirmwareSupervisor:
             self._enter(state, t)
 
     def _next(self, t: float, age: float, in_air: bool) -> str:
-        """The next state; the first rule that holds counts. States that last for one step only are left out."""
-        state, late = self.state, age > SHUTDOWN_S
-        if state == NOT_READY:
-            return LOCKED if self.emergency else state if self.tumbled else CHECKED
-        if state == CHECKED:
-            return LOCKED if self.emergency else NOT_READY if self.tumbled else READY if self.armed else state
-        if state == READY:
-            if self.emergency:
-                return LOCKED
-            if self.tumbled or not self.armed or t - self._since > PREFLIGHT_TIMEOUT_S:
-                return NOT_READY
-            return FLYING if in_air else state
-        if state == FLYING:
-            if late or self.emergency:
-                return LOCKED
-            if self.tumbled:
-                return CRASHED
-            if not self.armed:
-                return NOT_READY
-            if age > LEVEL_OUT_S:
-                return LEVEL_OUT
-            return state if in_air else LANDED
-        if state == LEVEL_OUT:
-            if late or self.tumbled or self.emergency:
-                return LOCKED
-            return state if age > LEVEL_OUT_S else FLYING
-        if state == LANDED:  # not even an emergency stop counts here; it does once the motors are off
-            if not self.armed or t - self._since > LANDING_TIMEOUT_S:
-                return NOT_READY
-            return FLYING if in_air else state
-        if state == CRASHED:
-            if not self.crashed and not self.tumbled:
-                return NOT_READY
-            return LOCKED if self.emergency else state
-        return state
+        holds = {
+            "emergency": bool(self.emergency),
+            "tumbled": self.tumbled,
+            "upright": not self.tumbled,
+            "recovered": not self.crashed and not self.tumbled,
+            "armed": self.armed,
+            "disarmed": not self.armed,
+            "in the air": in_air,
+            "on the floor": not in_air,
+            "new setpoint": age <= LEVEL_OUT_S,
+            "old setpoint": age > LEVEL_OUT_S,
+            "no setpoint": age > SHUTDOWN_S,
+            "never took off": t - self._since > PREFLIGHT_TIMEOUT_S,
+            "stood long": t - self._since > LANDING_TIMEOUT_S,
+        }
+        return next((state for rule, state in _NEXT.get(self.state, ()) if holds[rule]), self.state)
 
     def _enter(self, state: str, t: float) -> None:
         before, self.state, self._since = self.state, state, t
@@ -148,14 +143,8 @@ class FirmwareSupervisor:
 
     def info(self, *, planner_active: bool, trajectory_finished: bool) -> int:
         """The bit field `supervisor.info`."""
-        bits = IS_ARMED if self.armed else 0
-        bits |= CAN_BE_ARMED if self.state == CHECKED and not self.refuse_arming else 0
-        bits |= AUTO_ARM if self.auto_arming else 0
-        bits |= CAN_FLY if self.motors_allowed else 0
-        bits |= IS_FLYING if self.flying else 0
-        bits |= IS_TUMBLED if self.tumbled else 0
-        bits |= IS_LOCKED if self.state == LOCKED else 0
-        bits |= IS_CRASHED if self.crashed else 0
-        bits |= HL_ACTIVE if planner_active else 0
-        bits |= HL_FINISHED if trajectory_finished else 0
-        return bits
+        flags = (  # from the lowest bit on
+            self.state == CHECKED and not self.refuse_arming, self.armed, self.auto_arming, self.motors_allowed,
+            self.flying, self.tumbled, self.state == LOCKED, self.crashed, planner_active, trajectory_finished,
+        )  # fmt: skip
+        return sum(1 << bit for bit, flag in enumerate(flags) if flag)

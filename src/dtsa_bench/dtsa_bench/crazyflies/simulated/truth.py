@@ -26,14 +26,14 @@ class TruthLog:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("w", encoding="utf-8")
-            self._line({"fleet": header})
+            self._file.write(json.dumps({"fleet": header}) + "\n")
 
     def event(self, t: float, cf: int, name: str, **details: Any) -> None:
         """Something happened to vehicle `cf` (id from 1; 0: the fleet) at t (s)."""
         entry = {"t": round(t, 3), "cf": cf, "event": name, **details}
         self.events.append(entry)
-        self._line(entry)
         if self._file is not None:
+            self._file.write(json.dumps(entry) + "\n")
             self._file.flush()
 
     def positions(self, t: float, position: NDArray[np.float64]) -> None:
@@ -46,10 +46,6 @@ class TruthLog:
             self._file.flush()
             self._flushed = t
 
-    def _line(self, entry: dict[str, Any]) -> None:
-        if self._file is not None:
-            self._file.write(json.dumps(entry) + "\n")
-
     def close(self) -> None:
         """End of the record."""
         if self._file is not None:
@@ -59,17 +55,8 @@ class TruthLog:
 
 def read_truth(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], list[dict[str, Any]]]:
     """Times (T,), positions (T, 3, N) and events of a record. A last line that was cut off is ignored."""
-    times: list[float] = []
-    tracks: list[list[list[float]]] = []
-    events: list[dict[str, Any]] = []
-    with path.open(encoding="utf-8") as lines:
-        for line in lines:
-            if not line.endswith("\n"):
-                break
-            entry = json.loads(line)
-            if "p" in entry:
-                times.append(entry["t"])
-                tracks.append(entry["p"])
-            elif "event" in entry:
-                events.append(entry)
-    return np.array(times), np.array(tracks), events
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1]
+    entries = [json.loads(line) for line in lines]
+    moments = [entry for entry in entries if "p" in entry]
+    events = [entry for entry in entries if "event" in entry]
+    return np.array([entry["t"] for entry in moments]), np.array([entry["p"] for entry in moments]), events

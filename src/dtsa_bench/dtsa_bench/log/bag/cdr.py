@@ -13,17 +13,17 @@ from itertools import repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.ros.common.cdr import REPRESENTATION, SECOND
-from dtsa_agent.ros.common.cdr import POSE_COVARIANCE, TWIST_COVARIANCE
+from dtsa_agent.ros.common.cdr import POSE_COVARIANCE, REPRESENTATION, SECOND, TWIST_COVARIANCE
+from dtsa_agent.ros.common.names import FRAME
 from dtsa_bench.drawing import palette
 
-STAMP = struct.Struct("<iI")
-_VECTOR = struct.Struct("<3d")
+_STAMP, _VECTOR = struct.Struct("<iI"), struct.Struct("<3d")
 
 # visualization_msgs/Marker
 SPHERE, CYLINDER, TEXT = 2, 3, 9
 DELETE_ALL = 3
-SIZE = 7  # numbers of a pose, which stand before the scale
+_POSE = 7  # numbers, which stand before the scale
+_DIAMETER_M = 0.2  # of spheres; the name stands above
 # What an agent's radio does in a slot.
 QUIET, WAITING, SENDING, COLLIDED = 0, 1, 2, 3
 # A sphere has its agent's colour; who sends is larger, and its name has the colour of what became of the frame.
@@ -70,7 +70,7 @@ class OdometryPacker:
     it is. Covariances do not claim certainty: see dtsa_agent.ros.common.cdr.
     """
 
-    def __init__(self, child_frames: Sequence[str], frame: str = "map") -> None:
+    def __init__(self, child_frames: Sequence[str], frame: str = FRAME) -> None:
         self._templates: list[tuple[bytearray, int, int]] = []
         for child in child_frames:
             message = CdrBuilder()
@@ -82,108 +82,71 @@ class OdometryPacker:
             self._templates.append((bytearray(REPRESENTATION + message.data), position + 4, twist + 4))
 
     def pack(self, stamp_ns: int, position: NDArray[np.float64], velocity: NDArray[np.float64]) -> list[bytes]:
-        """One message a body.
-
-        :param position: m, (3, n), in the frame.
-        :param velocity: m/s, (3, n), in the frame.
-        """
-        seconds, nanoseconds = divmod(stamp_ns, SECOND)
-        messages = []
-        for (data, place, twist), where, speed in zip(
-            self._templates, position.T.tolist(), velocity.T.tolist(), strict=True
-        ):
-            STAMP.pack_into(data, 4, seconds, nanoseconds)
-            _VECTOR.pack_into(data, place, *where)
-            _VECTOR.pack_into(data, twist, *speed)
+        """One message a body, of position and velocity, (3, n), m and m/s, in the frame."""
+        stamp, messages = divmod(stamp_ns, SECOND), []
+        states = zip(self._templates, position.T.tolist(), velocity.T.tolist(), strict=True)
+        for (data, position_at, twist_at), point, speed in states:
+            _STAMP.pack_into(data, 4, *stamp)
+            _VECTOR.pack_into(data, position_at, *point)
+            _VECTOR.pack_into(data, twist_at, *speed)
             messages.append(bytes(data))
         return messages
 
 
 class MarkerPacker:
-    """CDR of a `visualization_msgs/MarkerArray` of a swarm: sphere, name and target of each agent.
+    """CDR of a `visualization_msgs/MarkerArray` of agents: a sphere, the name and the target of each, a flat disc."""
 
-    :param diameter: m, of the spheres.
-    :param targets: whether each agent's target is drawn too, as a flat disc.
-    :param ids: the agents' ids; None: 1, 2, ...
-    """
-
-    def __init__(
-        self,
-        names: Sequence[str],
-        diameter: float = 0.2,
-        frame: str = "map",
-        targets: bool = True,
-        ids: Sequence[int] | None = None,
-    ) -> None:
-        self._n = len(names)
-        message = CdrBuilder()
-        kinds = 3 if targets else 2
-        message.number("I", kinds * self._n)
-        stamps, places, colours = [], [], []
-        for kind in range(kinds):
-            for number, name in zip(ids or range(1, self._n + 1), names, strict=True):
-                stamp, place, colour = self._add(message, kind, number, name, diameter, frame)
-                stamps.append(stamp)
-                places.append(place)
-                colours.append(colour)
+    def __init__(self, ids: Sequence[int]) -> None:
+        message, shape = CdrBuilder(), (3, len(ids))
+        message.number("I", 3 * len(ids))
+        offsets = [self._add(message, kind, agent, f"cf{agent}") for kind in range(3) for agent in ids]
+        stamps, places, colours = np.array(offsets, np.intp).reshape(-1, 3).T
         self._data = bytearray(REPRESENTATION + message.data)
         body = memoryview(self._data)[4:]
-        whole = len(body) // 8 * 8
-        self._f8 = np.frombuffer(body[:whole], "<f8")
+        self._f8 = np.frombuffer(body[: len(body) // 8 * 8], "<f8")
         self._f4 = np.frombuffer(body[: len(body) // 4 * 4], "<f4")
         self._i4 = self._f4.view("<i4")
-        self._stamps = np.array(stamps) // 4
-        self._places = (np.array(places).reshape(kinds, self._n)[:, :, None] // 8) + np.arange(3)
-        tints = np.array(colours).reshape(kinds, self._n)[:, :, None] // 4 + np.arange(4)
+        self._stamps = stamps // 4
+        self._places = places.reshape(shape)[:, :, None] // 8 + np.arange(3)
+        tints = colours.reshape(shape)[:, :, None] // 4 + np.arange(4)
         self._opacity, self._name_tints = tints[0][:, 3], tints[1]
-        self._sizes = self._places[0][:, :1] + SIZE + np.arange(3)
-        self._diameter, self._lift = diameter, 0.75 * diameter
+        self._sizes = self._places[0][:, :1] + _POSE + np.arange(3)
 
     def pack(
-        self,
-        stamp_ns: int,
-        position: NDArray[np.float64],
-        state: NDArray[np.uint8],
-        target: NDArray[np.float64] | None = None,
+        self, stamp_ns: int, position: NDArray[np.float64], state: NDArray[np.uint8], target: NDArray[np.float64]
     ) -> bytes:
-        """The whole array as one message.
+        """The whole array as one message; position and target: (3, n), m.
 
-        :param position: m, (3, n), in the frame.
         :param state: (n,), QUIET (pale), WAITING, SENDING or COLLIDED.
-        :param target: m, (3, n); needed if the targets are drawn.
         """
-        seconds, nanoseconds = divmod(stamp_ns, SECOND)
-        self._i4[self._stamps] = seconds
-        self._i4[self._stamps + 1] = nanoseconds
-        self._f8[self._places[0]] = position.T
-        self._f8[self._places[1]] = position.T
-        self._f8[self._places[1][:, 2]] += self._lift
-        if len(self._places) > 2 and target is not None:
-            self._f8[self._places[2]] = target.T
-        self._f8[self._sizes] = (self._diameter * SWELLING[state])[:, None]
+        self._i4[self._stamps], self._i4[self._stamps + 1] = divmod(stamp_ns, SECOND)
+        for places, points in zip(self._places, (position, position, target), strict=True):
+            self._f8[places] = points.T
+        self._f8[self._places[1][:, 2]] += 0.75 * _DIAMETER_M
+        self._f8[self._sizes] = (_DIAMETER_M * SWELLING[state])[:, None]
         self._f4[self._opacity] = OPACITY[state]
         self._f4[self._name_tints] = NAMES[state]
         return bytes(self._data)
 
     @classmethod
-    def nothing(cls, frame: str = "map") -> bytes:
+    def nothing(cls) -> bytes:
         """A message that takes all markers away."""
         message = CdrBuilder()
         message.number("I", 1)
-        cls._add(message, 0, 0, "", 1.0, frame, DELETE_ALL)
+        cls._add(message, 0, 0, "", DELETE_ALL)
         return REPRESENTATION + bytes(message.data)
 
     @staticmethod
-    def _add(
-        message: CdrBuilder, kind: int, number: int, name: str, diameter: float, frame: str, action: int = 0
-    ) -> tuple[int, int, int]:
+    def _add(message: CdrBuilder, kind: int, agent: int, name: str, action: int = 0) -> tuple[int, int, int]:
+        """Append a marker: sphere, name or target; return where its stamp, its position and its colour are."""
         shape = (SPHERE, TEXT, CYLINDER)[kind]
-        scale = ((diameter,) * 3, (0.0, 0.0, 0.6 * diameter), (diameter, diameter, 0.02))[kind]
-        own = palette.rgb(palette.agent_colour(number))
+        size = 1.0 if action else _DIAMETER_M
+        scale = ((size,) * 3, (0.0, 0.0, 0.6 * size), (size, size, 0.02))[kind]
+        own = palette.rgb(palette.agent_colour(agent))
         colour = ((*own, 1.0), (0.45, 0.50, 0.58, 1.0), (*own, 0.35))[kind]
-        stamp = message.stamp(frame)
+        stamp = message.stamp(FRAME)
         message.text(("agent", "name", "target")[kind])
-        message.number("i", number, shape, action)
+        message.number("i", agent, shape, action)
         place = message.number("d", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *scale)
         tint = message.number("f", *colour)
         message.number("i", 0, 0)  # lifetime: for ever

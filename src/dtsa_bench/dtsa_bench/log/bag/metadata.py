@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -28,8 +27,6 @@ MERGED_FROM = "merged_from"  # custom data of a bag that was made from the bags 
 RECOVERED_FROM = "recovered_from"  # custom data of a bag that `recover` has made: name of the damaged file
 MAX_UNPACKED_BYTES = 1 << 36  # of a file that is compressed as a whole
 MAX_MESSAGE_BYTES = 1 << 30  # of a message that is compressed by itself; for one that does not say its size
-_SQLITE = "an sqlite3 bag; `rosbags-convert --src {} --dst NEW --dst-storage mcap` makes an mcap bag of it"
-_PART = re.compile(r"(.*)_(\d+)\.mcap(?:\.zstd)?")
 
 Profile = dict[str, Any]  # quality of service of a publisher, with the fields of rosbag2
 
@@ -45,44 +42,39 @@ def bag_of(path: str | Path) -> Path:
 def find_files(path: str | Path) -> list[Path]:
     """The files of what was given as a recorded run, in their order: .mcap, or .mcap.zstd where compressed as a whole.
 
+    Those of a bag that was split are those of metadata.yaml, else X_0.mcap, X_1.mcap, ...
+
     :raises UnusableBag: if there is none, or several that are not the parts of one bag.
     """
-    path = bag_of(path)
-    if not path.exists():
-        raise UnusableBag(path, "there is no such file or directory")
-    if not path.is_dir():
-        if path.suffix == ".db3":
-            raise UnusableBag(path, _SQLITE.format(path.parent))
-        return [path]
-    plain = {file.name: file for file in path.glob("*.mcap")}
-    packed = {file.name: file for file in path.glob("*.mcap.zstd") if file.stem not in plain}
-    files = list({**plain, **packed}.values())
-    if len(files) > 1:
-        return _parts(path, files)
-    if not files:
-        if any(path.glob("*.db3")):
-            raise UnusableBag(path, _SQLITE.format(path))
-        below = sorted(entry.parent.name for entry in path.glob("*/*.mcap"))
+    bag = bag_of(path)
+    if not bag.exists():
+        raise UnusableBag(bag, "there is no such file or directory")
+    found = {file.name.removesuffix(".zstd"): file for packed in (".zstd", "") for file in bag.glob(f"*.mcap{packed}")}
+    if bag.suffix == ".db3" or (not found and any(bag.glob("*.db3"))):
+        source = bag if bag.is_dir() else bag.parent
+        convert = f"`rosbags-convert --src {source} --dst NEW --dst-storage mcap` makes an mcap bag of it"
+        raise UnusableBag(bag, f"an sqlite3 bag; {convert}")
+    if not bag.is_dir():
+        return [bag]
+    if not found:
+        below = sorted(entry.parent.name for entry in bag.glob("*/*.mcap"))
         hint = f"; did you mean one of {', '.join(below[:5])} in it?" if below else ""
-        raise UnusableBag(path, f"the directory holds no .mcap file{hint}")
-    return files
-
-
-def _parts(directory: Path, files: Sequence[Path]) -> list[Path]:
-    """The files of a bag that was split, in their order: those of metadata.yaml, else X_0.mcap, X_1.mcap, ..."""
-    listed = read(directory).get("relative_file_paths")
+        raise UnusableBag(bag, f"the directory holds no .mcap file{hint}")
+    listed = read(bag).get("relative_file_paths") if len(found) > 1 else None
     if isinstance(listed, list) and listed:
-        found = {file.name.removesuffix(".zstd"): file for file in files}
-        names = [Path(str(name)).name for name in listed]
-        missing = [name for name in names if name.removesuffix(".zstd") not in found]
-        if missing:
-            raise UnusableBag(directory, f"{', '.join(missing[:5])}, which {FILE_NAME} names, is missing: name a file")
-        return [found[name.removesuffix(".zstd")] for name in names]
-    parts = {int(match[2]): file for file in files if (match := _PART.fullmatch(file.name))}
-    stems = {file.name.rpartition("_")[0] for file in files}
-    if len(stems) == 1 and sorted(parts) == list(range(len(files))):
-        return [file for _, file in sorted(parts.items())]
-    raise UnusableBag(directory, f"holds {len(files)} .mcap files that are not the parts of one bag: name one of them")
+        names = [Path(str(name)).name.removesuffix(".zstd") for name in listed]
+        if missing := [name for name in names if name not in found]:
+            raise UnusableBag(bag, f"{', '.join(missing[:5])}, which {FILE_NAME} names, is missing: name a file")
+    elif len(found) > 1:
+        stem = next(iter(found)).rpartition("_")[0]
+        names = [f"{stem}_{number}.mcap" for number in range(len(found))]
+        if set(names) != set(found):
+            raise UnusableBag(
+                bag, f"holds {len(found)} .mcap files that are not the parts of one bag: name one of them"
+            )
+    else:
+        names = list(found)
+    return [found[name] for name in names]
 
 
 def open_file(path: Path) -> IO[bytes]:
@@ -93,20 +85,15 @@ def open_file(path: Path) -> IO[bytes]:
     try:
         if path.suffix != ".zstd":
             return path.open("rb")
-        with ExitStack() as stack:
-            unpacked = stack.enter_context(TemporaryFile())
-            with (
-                path.open("rb") as packed,
-                suppress(zstandard.ZstdError),
-            ):  # of a damaged file the beginning is unpacked
-                reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-                while block := reader.read(1 << 20):
-                    unpacked.write(block)
-                    if unpacked.tell() > MAX_UNPACKED_BYTES:
-                        raise UnusableBag(path, f"it is larger than {MAX_UNPACKED_BYTES >> 30} GiB when unpacked")
-            unpacked.seek(0)
-            stack.pop_all()
-            return unpacked
+        unpacked = TemporaryFile()
+        with path.open("rb") as packed, suppress(zstandard.ZstdError):  # of a damaged file the beginning is unpacked
+            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while block := reader.read(1 << 20):
+                unpacked.write(block)
+                if unpacked.tell() > MAX_UNPACKED_BYTES:
+                    raise UnusableBag(path, f"it is larger than {MAX_UNPACKED_BYTES >> 30} GiB when unpacked")
+        unpacked.seek(0)
+        return unpacked
     except OSError as error:
         raise UnusableBag(path, f"cannot be read: {error.strerror or error}") from None
 
@@ -154,9 +141,9 @@ def read(directory: Path) -> dict[str, Any]:
 def read_beside(file: Path, given: str | Path) -> dict[str, Any]:
     """What `metadata.yaml` beside a file says, if it is of the bag that was given."""
     content = read(file.parent)
-    names = content.get("relative_file_paths")
-    listed = isinstance(names, list) and file.name in (Path(str(name)).name for name in names)
-    return content if listed or Path(given).is_dir() else {}
+    listed = content.get("relative_file_paths")
+    names = [Path(str(name)).name for name in listed] if isinstance(listed, list) else []
+    return content if file.name in names or Path(given).is_dir() else {}
 
 
 def has_packed_messages(content: Mapping[str, Any]) -> bool:

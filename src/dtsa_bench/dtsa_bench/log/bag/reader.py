@@ -19,10 +19,9 @@ from typing import IO, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Channel, Chunk, DataEnd, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.summary import Summary
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -36,7 +35,6 @@ from .schema import Definition
 
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
-_DATA_END = struct.Struct("<BQI")  # opcode, length, checksum of all that stands before it; 0: none
 _END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
 _ROS = "cdr/ros2msg"
 _MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
@@ -77,44 +75,23 @@ class Bag:
 
     def __init__(self, path: str | Path) -> None:
         self.given = Path(path)
-        paths = self._paths = metadata.find_files(self.given)
-        self.path = paths[0]
-        with ExitStack() as stack:
-            self._open([(part, stack.enter_context(metadata.open_file(part))) for part in paths])
-            self._files = stack.pop_all()
-
-    def _open(self, files: list[tuple[Path, IO[bytes]]]) -> None:
-        self._parts: list[tuple[IO[bytes], SeekingReader, Summary]] = []  # a file each
+        self._paths = metadata.find_files(self.given)
+        self.path = self._paths[0]
         self.topics: dict[str, Topic] = {}
-        for path, stream in files:
-            if stream.read(len(MAGIC)) != MAGIC:
-                raise UnusableBag(self.given, f"{path.name} is not an MCAP file")
-            try:
-                stream.seek(-len(MAGIC), 2)
-                if stream.read() != MAGIC:
-                    raise McapError("no end mark")
-                reader, summary = read_index(stream)
-                reader.get_header()
-            except Exception as error:  # the library meets damaged files with many kinds of errors
-                raise self._damaged(f"it was not closed, or is damaged ({error or type(error).__name__})") from None
-            if summary is None or summary.statistics is None:
-                raise self._damaged("it has no index")
-            if summary.statistics.message_count and not summary.chunk_indexes:
-                raise self._damaged("its messages are not in indexed chunks")
-            counts = {number: count for number, count in summary.statistics.channel_message_counts.items() if count}
-            self._find_channels(summary, counts, stream)
-            self._add_topics(summary, counts)
-            self._parts.append((stream, reader, summary))
-        if self.topics and all(topic.encoding != _ROS for topic in self.topics.values()):
-            topic = next(iter(self.topics.values()))
-            raise UnusableBag(
-                self.given, f"topic {topic.name} is recorded as {topic.encoding}, not as {_ROS}: not a ROS 2 bag"
-            )
-        statistics = [summary.statistics for _, _, summary in self._parts if summary.statistics]
-        self.message_count = sum(part.message_count for part in statistics)
-        self.start_ns: int = min((part.message_start_time for part in statistics if part.message_count), default=0)
-        self.end_ns: int = max(part.message_end_time for part in statistics)
-        records = self._records()
+        self._readers: list[SeekingReader] = []  # a file each
+        self.message_count = self.start_ns = self.end_ns = 0
+        records = [metadata.read_beside(self.path, self.given)]
+        with ExitStack() as stack:
+            for part in self._paths:
+                reader = self._add_file(part, stack.enter_context(metadata.open_file(part)))
+                with suppress(Exception):  # of a damaged record: whatever the library meets, there is none then
+                    named = (one for one in reader.iter_metadata() if one.name == metadata.RECORD_NAME)
+                    records = [metadata.load_record(one) for one in named][::-1] + records
+            if self.topics and all(topic.encoding != _ROS for topic in self.topics.values()):
+                topic = next(iter(self.topics.values()))
+                why = f"topic {topic.name} is recorded as {topic.encoding}, not as {_ROS}: not a ROS 2 bag"
+                raise UnusableBag(self.given, why)
+            self._files = stack.pop_all()
         self._has_packed_messages = any(map(metadata.has_packed_messages, records))
         # Of the types that were decoded.
         kinds = frozenset((topic.type, topic.definition, topic.encoding) for topic in self.topics.values())
@@ -122,54 +99,48 @@ class Bag:
         #: The recorder's own texts; empty in a foreign bag.
         self.custom_data = next(filter(None, map(metadata.custom_data, records)), {})
 
+    def _add_file(self, path: Path, stream: IO[bytes]) -> SeekingReader:
+        """Add what the index of a file says."""
+        if stream.read(len(MAGIC)) != MAGIC:
+            raise UnusableBag(self.given, f"{path.name} is not an MCAP file")
+        try:
+            stream.seek(-len(MAGIC), 2)
+            if stream.read() != MAGIC:
+                raise McapError("no end mark")
+            reader, summary = read_index(stream)
+            reader.get_header()
+            if summary is None or summary.statistics is None:
+                raise McapError("it has no index")
+            statistics = summary.statistics
+            if statistics.message_count and not summary.chunk_indexes:
+                raise McapError("its messages are not in indexed chunks")
+            counts = {number: count for number, count in statistics.channel_message_counts.items() if count}
+            _complete_channels(summary, counts, stream)
+        except Exception as error:  # the libraries meet damaged files with many kinds of errors
+            raise self._damaged(f"it was not closed, or is damaged ({error or type(error).__name__})") from None
+        for number, channel in sorted(summary.channels.items()):
+            self._add_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
+        if statistics.message_count:
+            start_ns = statistics.message_start_time
+            self.start_ns = min(self.start_ns, start_ns) if self.message_count else start_ns
+            self.end_ns = max(self.end_ns, statistics.message_end_time)
+        self.message_count += statistics.message_count
+        self._readers.append(reader)
+        return reader
+
+    def _add_topic(self, channel: Channel, schema: Schema | None, count: int) -> None:
+        definition, before = definition_of(channel, schema), self.topics.get(channel.topic)
+        if definition.name.startswith(_ON_A_NETWORK):
+            raise UnusableBag(self.given, _MERGED.format(program()))
+        profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
+        self.topics[channel.topic] = Topic(
+            channel.topic, definition.name, count + (before.count if before else 0),
+            profiles or (before.profiles if before else ()), definition.type_hash, definition.text,
+            f"{definition.message_encoding}/{definition.encoding or 'no schema'}",
+        )  # fmt: skip
+
     def _damaged(self, what: str) -> UnusableBag:
         return UnusableBag(self.given, f"{what}; `{program()} recover {self.given}` saves what can be read")
-
-    def _find_channels(self, summary: Summary, counts: Mapping[int, int], stream: IO[bytes]) -> None:
-        """Complete a summary that repeats no channels or schemas by those that stand before the messages."""
-        for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
-            channels = [summary.channels.get(number) for number in counts]
-            if all(channel and channel.schema_id in (0, *summary.schemas) for channel in channels):
-                return
-            try:
-                stream.seek(index.chunk_start_offset + PREFIX.size)
-                records = breakup_chunk(Chunk.read(ReadDataStream(stream)), validate_crc=True)
-            except Exception as error:  # the libraries meet damage with many kinds of errors
-                raise self._damaged(f"damaged chunk at byte {index.chunk_start_offset}: {error}") from None
-            for record in records:
-                if isinstance(record, Schema):
-                    summary.schemas.setdefault(record.id, record)
-                elif isinstance(record, Channel):
-                    summary.channels.setdefault(record.id, record)
-        if not counts.keys() <= summary.channels.keys():
-            raise self._damaged("the channels of some messages are not defined")
-
-    def _add_topics(self, summary: Summary, counts: Mapping[int, int]) -> None:
-        for number, channel in sorted(summary.channels.items()):
-            definition = definition_of(channel, summary.schemas.get(channel.schema_id))
-            if definition.name.startswith(_ON_A_NETWORK):
-                raise UnusableBag(self.given, _MERGED.format(program()))
-            before = self.topics.get(channel.topic)
-            profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
-            self.topics[channel.topic] = Topic(
-                channel.topic,
-                definition.name,
-                counts.get(number, 0) + (before.count if before else 0),
-                profiles or (before.profiles if before else ()),
-                definition.type_hash,
-                definition.text,
-                f"{definition.message_encoding}/{definition.encoding or 'no schema'}",
-            )
-
-    def _records(self) -> list[dict[str, Any]]:
-        """What the recorder stored beside the messages: in the files, then in `metadata.yaml`, if that is of them."""
-        records = []
-        for _, reader, _ in self._parts:
-            with suppress(Exception):  # of a damaged record: whatever the library meets, there is none then
-                for record in reader.iter_metadata():
-                    if record.name == metadata.RECORD_NAME:
-                        records.insert(0, metadata.load_record(record))
-        return [*records, metadata.read_beside(self.path, self.given)]
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -198,7 +169,7 @@ class Bag:
         for name in topics or ():
             self.topic(name)
         wanted = None if topics is None else set(topics)
-        parts = [self._messages(reader, wanted, start_ns, end_ns) for _, reader, _ in self._parts]
+        parts = [self._messages(reader, wanted, start_ns, end_ns) for reader in self._readers]
         return heapq.merge(*parts, key=lambda message: message.log_time_ns) if len(parts) > 1 else parts[0]
 
     def _messages(
@@ -218,9 +189,8 @@ class Bag:
         :raises UnusableBag: if the bag has no such topic.
         """
         if name not in self.topics:
-            raise UnusableBag(
-                self.given, f"it has no topic {name!r}; it has {', '.join(sorted(self.topics)) or 'none'}"
-            )
+            names = ", ".join(sorted(self.topics)) or "none"
+            raise UnusableBag(self.given, f"it has no topic {name!r}; it has {names}")
         return self.topics[name]
 
     def decode(self, message: BagMessage) -> Any:
@@ -268,6 +238,22 @@ class Bag:
         self.close()
 
 
+def _complete_channels(summary: Summary, counts: Mapping[int, int], stream: IO[bytes]) -> None:
+    """Complete a summary that repeats no channels or schemas by those that stand before the messages."""
+    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+        channels = [summary.channels.get(number) for number in counts]
+        if all(channel and channel.schema_id in (0, *summary.schemas) for channel in channels):
+            return
+        stream.seek(index.chunk_start_offset + PREFIX.size)
+        for record in breakup_chunk(Chunk.read(ReadDataStream(stream)), validate_crc=True):
+            if isinstance(record, Schema):
+                summary.schemas.setdefault(record.id, record)
+            elif isinstance(record, Channel):
+                summary.channels.setdefault(record.id, record)
+    if not counts.keys() <= summary.channels.keys():
+        raise McapError("the channels of some messages are not defined")
+
+
 @lru_cache(maxsize=16)
 def shared_typestore(definitions: frozenset[tuple[str, ...]]) -> Typestore:
     """The types of bags with these definitions and encodings, empty at first: compiling them takes longer than reading.
@@ -299,18 +285,16 @@ def checksum_fault(path: Path) -> str:
         with metadata.open_file(path) as stream:
             read_index(stream)
             stream.seek(-_END.size, 2)
-            start, _, _, mark = _END.unpack(stream.read())
-            stream.seek(start - _DATA_END.size)
-            opcode, length, checksum = _DATA_END.unpack(stream.read(_DATA_END.size))
-            if mark != MAGIC or opcode != Opcode.DATA_END or length != _DATA_END.size - PREFIX.size:
-                return "the end of its messages is damaged"
+            index_start, *_ = _END.unpack(stream.read())
             stream.seek(0)
-            left, found = start - _DATA_END.size, 0
-            while left and (block := stream.read(min(left, 1 << 20))):
-                left, found = left - len(block), zlib.crc32(block, found)
+            records = StreamReader(stream, emit_chunks=True, validate_crcs=True).records
+            if not any(isinstance(record, DataEnd) for record in records) or stream.tell() != index_start:
+                return "the end of its messages is damaged"
+    except CRCValidationError:
+        return "its contents do not fit their checksum"
     except Exception as error:  # the library meets damaged files with many kinds of errors
-        return f"its index is damaged ({error or type(error).__name__})"
-    return "" if checksum in (0, found) else "its contents do not fit their checksum"
+        return f"it is damaged ({error or type(error).__name__})"
+    return ""
 
 
 def read_index(stream: IO[bytes]) -> tuple[SeekingReader, Summary | None]:

@@ -24,6 +24,7 @@ from mcap.writer import CompressionType, Writer
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.cdr import RUN_MESSAGES, without_run
 from dtsa_bench import __version__
+from dtsa_bench.runs.options import check_free
 from dtsa_bench.runs.program import program
 
 from . import metadata
@@ -58,16 +59,14 @@ class BagWriter:
 
     :param directory: where the bag is made; must not exist, or be empty. Parents are made. Or the name of an .mcap file,
         for a bag that is this file alone.
-    :param config: configuration of the run, JSON types only: stored whole in the bag, its `seed` once more
-        by itself; None: the bag says nothing of its origin but `custom_data`.
+    :param config: configuration of the run, JSON types only; None: the bag says nothing of its origin but `custom_data`.
     :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
     :param chunk_size: bytes, size at which a chunk is closed even if its half second is not over.
-    :param custom_data: further texts for `custom_data` of the metadata.
     :param min_time_ns: ns, earliest log time that is accepted.
     :param marked: whether chunks end at a `mark` only; the recorder calls it after each step of the run.
     :param profile: MCAP's name for the conventions that topics and messages follow.
     :raises ConfigError: if the directory is in use or the compression is unknown.
-    :raises BagError: if the directory cannot be made or written to.
+    :raises BagError: if the directory cannot be made or written to; likewise below, for a full disk or a closed bag.
     """
 
     def __init__(
@@ -85,8 +84,8 @@ class BagWriter:
             raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
         self.directory = Path(directory)
         self._is_file = self.directory.suffix == ".mcap"
-        if not self._is_file and self.directory.exists() and (not self.directory.is_dir() or any(self.directory.iterdir())):
-            raise ConfigError("directory of the bag", str(directory), "one that is empty or does not exist yet")
+        if not self._is_file:
+            check_free(self.directory, "directory of the bag")
         self.custom_data = dict(custom_data or {})
         if config is not None:
             self.custom_data |= {
@@ -103,16 +102,16 @@ class BagWriter:
         self._digest = BagDigest()
         self._start_ns, self._end_ns = 1 << 63, 0
         self._unsaved = 0  # messages since the last flush
-        self._failure = ""
-        self._closed = False
+        self._ended = ""  # why nothing more can be recorded
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = self.path.open("xb")
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
-        size = _UNLIMITED if marked else chunk_size
-        kind = COMPRESSIONS[compression]
-        self._mcap = Writer(self._stream, chunk_size=size, compression=kind, enable_data_crcs=True)
+        self._mcap = Writer(
+            self._stream, chunk_size=_UNLIMITED if marked else chunk_size, compression=COMPRESSIONS[compression],
+            enable_data_crcs=True,
+        )  # fmt: skip
         with self._failing():
             self._mcap.start(profile=profile, library=f"dtsa {__version__}")
             self._add_own_metadata()
@@ -141,15 +140,11 @@ class BagWriter:
         qos: str | Sequence[metadata.Profile] = "reliable",
         definition: Definition | None = None,
     ) -> int:
-        """Announce a topic; may be done at any time before its first message.
+        """Announce a topic, at any time before its first message; return the channel for `write`.
 
-        :param topic: full name, with its leading slash.
-        :param type_name: "package/msg/Type".
         :param qos: name from `metadata.PROFILES`, or the profiles that its publishers offer.
         :param definition: message definition and type hash; None: those of the installed type.
-        :return: the channel for `write`.
         :raises ConfigError: if the topic is there already or the QoS name is unknown.
-        :raises BagError: if the type is not installed.
         """
         self._check_open()
         if any(channel.topic == topic for channel in self._channels):
@@ -173,15 +168,12 @@ class BagWriter:
     ) -> None:
         """Record one message.
 
-        :param channel: number of the channel, as `add_topic` gave it.
         :param data: the message as CDR, with its encapsulation header.
         :param log_time_ns: ns, simulated time of reception, 1 s or later.
         :param publish_time_ns: ns, simulated time of transmission.
         :param sequence: number of the message on its topic; None: the next one.
-        :raises BagError: if the message cannot be kept: full disk, closed bag.
         """
-        if self._closed or self._failure:
-            self._check_open()
+        self._check_open()
         if log_time_ns < self._min_time_ns:
             raise BagError(f"message at {log_time_ns} ns: times of a bag start at {self._min_time_ns} ns")
         if not 0 < channel <= len(self._channels):
@@ -203,16 +195,13 @@ class BagWriter:
             self.flush()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Store a metadata record of another name than rosbag2's; raises BagError if that fails."""
+        """Store a metadata record of another name than rosbag2's."""
         self.flush()  # such a record stands between chunks
         with self._failing():
             self._mcap.add_metadata(name, dict(values))
 
     def mark(self) -> None:
-        """What has been written until now is a run up to a complete step: a chunk may end here.
-
-        :raises BagError: if what is due cannot be saved.
-        """
+        """What has been written until now is a run up to a complete step: a chunk may end here."""
         if self._marked and (monotonic() >= self._next_flush or self._chunk_bytes > self._chunk_size):
             self.flush()
 
@@ -221,8 +210,6 @@ class BagWriter:
 
         `write`, or `mark` where there are marks, does this by itself every half second of wall time; a recorder that
         may wait long for its next message calls it too.
-
-        :raises BagError: if that fails, on a full disk for example.
         """
         self._check_open()
         with self._failing():
@@ -231,16 +218,8 @@ class BagWriter:
         self._next_flush = monotonic() + FLUSH_S
 
     def close(self) -> None:
-        """Finish the file and write `metadata.yaml`. Further calls do nothing.
-
-        :raises BagError: if the bag could not be finished; `recover` then makes a full bag of it.
-        """
-        if self._closed:
-            return
-        self._closed = True
-        if self._failure:  # the call that met it has reported it
-            with suppress(OSError):
-                self._stream.close()
+        """Finish the file and write `metadata.yaml`. Further calls do nothing."""
+        if self._ended:  # the call that met a failure has reported it
             return
         self.custom_data[KEY] = self._digest.hexdigest()
         with self._failing():
@@ -250,6 +229,7 @@ class BagWriter:
             self._stream.close()
             if not self._is_file:
                 metadata.write(self.directory, self._metadata())
+        self._ended = f"the bag {self.directory} is closed: nothing more can be recorded to it"
 
     def __enter__(self) -> BagWriter:
         return self
@@ -285,8 +265,8 @@ class BagWriter:
         self._mcap.add_metadata(metadata.RECORD_NAME, {metadata.RECORD_KEY: metadata.dump(self._metadata())})
 
     def _check_open(self) -> None:
-        if self._failure or self._closed:
-            raise BagError(self._failure or f"the bag {self.directory} is closed: nothing more can be recorded to it")
+        if self._ended:
+            raise BagError(self._ended)
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
@@ -297,13 +277,13 @@ class BagWriter:
 
     def _fail(self, error: OSError) -> NoReturn:
         lost = f", up to {self._unsaved} messages are not saved" if self._unsaved else ""
-        self._failure = (
+        self._ended = (
             f"recording to {self.path} stopped: {error.strerror or error}{lost}; "
             f"`{program()} recover {self.directory}` makes a full bag of the rest"
         )
         with suppress(OSError):
             self._stream.close()
-        raise BagError(self._failure) from error
+        raise BagError(self._ended) from error
 
 
 class BagDigest:

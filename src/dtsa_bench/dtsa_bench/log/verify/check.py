@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.log.arrays import FlightArrays, recorded_config
+from dtsa_bench.log.arrays import recorded_config
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM
 from dtsa_bench.log.bag.reader import Bag
@@ -35,29 +36,29 @@ def verify_bag(path: str | Path, progress: Callable[[int], None] | None = None) 
     begin = time.perf_counter()
     if bags := find_bags(path):
         result = Result(str(path), AGENT)
-        _noting(result, lambda: _verify_agents(bags, result))
+        with _noting(result):
+            _verify_agents(bags, result)
     else:
         with Bag(path) as bag:
             check_format(bag)
-            result = Result(str(path), _mode(bag), broken_off=BROKEN_OFF in bag.custom_data)
-            _noting(result, lambda: _verify(bag, result, progress))
+            keys = (key for key in _MODES if key in bag.custom_data)
+            mode = next((_MODES[key] for key in keys), str(bag.config.get("mode", LOCKSTEP)))
+            result = Result(str(path), mode, broken_off=BROKEN_OFF in bag.custom_data)
+            with _noting(result):
+                _verify(bag, result, progress)
             result.unheard = result.unheard or recorded_problem(bag.path)
     result.wall_time_s = time.perf_counter() - begin
     return result
 
 
-def _mode(bag: Bag) -> str:
-    """What kind of flight, or of record of one, a bag holds."""
-    for key, mode in ((MERGED_FROM, MERGED), (AGENT, AGENT), (SNIFFER, SNIFFER)):
-        if key in bag.custom_data:
-            return mode
-    return str(bag.config.get("mode", LOCKSTEP))
+_MODES = {MERGED_FROM: MERGED, AGENT: AGENT, SNIFFER: SNIFFER}  # by what custom data has in bags of other than flights
 
 
-def _noting(result: Result, check: Callable[[], None]) -> None:
-    """Check, and note the first difference."""
+@contextmanager
+def _noting(result: Result) -> Iterator[None]:
+    """Note the first difference that a check finds."""
     try:
-        check()
+        yield
     except Mismatch as mismatch:
         result.difference = mismatch.difference
     except UnusableBag as error:
@@ -77,29 +78,23 @@ def _verify_agents(paths: Sequence[Path], result: Result) -> None:
             raise UnusableBag(bag.path, bag.damage)
 
 
-def _check_sniffed(log: FlightArrays, result: Result) -> None:
-    """What a listener heard: frames tell of themselves whether they keep to the rules."""
-    result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
-    result.note_rules(check_rules(log, {}))
-    result.skipped["decisions"] = "a listener does not know them"
-
-
 def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) -> None:
     mode = result.mode
     # Missions say what they fly with instead of a mode of runs.
     settings = bag.config if mode in (LOCKSTEP, MERGED) else {**bag.config, "mode": REALTIME}
-    swarm = recorded_config(settings).swarm
-    contents = BagContents(bag, swarm.slot_ns, swarm.agents, result)
+    contents = BagContents(bag, recorded_config(settings).swarm.slot_ns, result)
     if mode == AGENT:
         _verify_agents([bag.path], result)
         return
     log = build_log(bag, contents.records)
     if mode == MERGED:
         check_merged(log, result)
-    elif mode == SNIFFER:
-        _check_sniffed(log, result)
     elif mode == LOCKSTEP:
         check_lockstep(log, contents, result, progress)
+    elif mode == SNIFFER:  # frames tell of themselves whether they keep to the rules
+        result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
+        result.note_rules(check_rules(log, {}))
+        result.skipped["decisions"] = "a listener does not know them"
     else:
         check_realtime(log, contents, result)
     contents.check_odometry(log)

@@ -16,10 +16,11 @@ from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest
 from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER
 
-from .result import Difference, Mismatch, Result
+from .result import Mismatch, Result
 
 EVENTS = "/parameter_events"
 MERGED = "merged"
+_PARAMETER_VALUES = {1: "bool_value", 2: "integer_value", 3: "double_value", 4: "string_value"}  # by type
 
 
 class BagContents:
@@ -30,91 +31,76 @@ class BagContents:
     :raises Mismatch: if times, numbers or the run's id of a message are wrong, or one is missing.
     """
 
-    def __init__(self, bag: Bag, slot_ns: int, agents: int, result: Result) -> None:
-        self._slot_ns, self._agents, self._result = slot_ns, agents, result
-        self._decode = bag.decode
+    def __init__(self, bag: Bag, slot_ns: int, result: Result) -> None:
+        self._bag, self._slot_ns, self._result = bag, slot_ns, result
         self.records: list[Any] = []
-        self.changes: list[tuple[int, dict[str, Any]]] = []  # slot, values
+        self.changes: dict[int, dict[str, Any]] = {}  # of the channel's settings, by the first slot in which they hold
         self._odometry: list[tuple[int, int, bytes]] = []  # slot, agent, message
-        self._digest, self._recorded = BagDigest(), bag.custom_data.get(KEY)
-        self._partial, self._whole = result.mode in (AGENT, SNIFFER), result.mode not in (AGENT, SNIFFER, MERGED)
-        self._whole_ns = 1 << 63  # log time up to which nothing is lost
-        if result.broken_off:
-            self._whole_ns = _number(bag, BROKEN_OFF)
-        sequences: dict[str, int] = {}
-        topics = {name: (name.encode(), info.type in RUN_MESSAGES) for name, info in bag.topics.items()}
-        run = _number(bag, RUN_ID, 16) if RUN_ID in bag.custom_data else 0
+        self._run = _number(bag, RUN_ID, 16) if RUN_ID in bag.custom_data else None
+        self._whole_ns = _number(bag, BROKEN_OFF) if result.broken_off else 1 << 63  # up to which nothing is lost
+        self._digest, sequences = BagDigest(), dict.fromkeys(bag.topics, 0)
+        topics = {name: (name.encode(), topic.type in RUN_MESSAGES) for name, topic in bag.topics.items()}
         for message in bag.messages():
             encoded, has_run = topics[message.topic]
             times = message.log_time_ns, message.publish_time_ns
             self._digest.add(encoded, *times, message.sequence, message.data, has_run)
-            expected = sequences.get(message.topic, 0)
+            expected, slot = sequences[message.topic], max(0, (message.log_time_ns - names.TIME_ZERO_NS) // slot_ns)
             sequences[message.topic] = message.sequence + 1
-            slot = max(0, (message.log_time_ns - names.TIME_ZERO_NS) // slot_ns)
             if message.sequence != expected and not result.broken_off:
                 why = "messages of a topic are numbered one after the other"
-                what = f"{message.topic}, sequence number"
-                raise Mismatch(Difference(what, str(expected), str(message.sequence), why, slot))
+                raise Mismatch(f"{message.topic}, sequence number", expected, message.sequence, why, slot)
             if message.log_time_ns > self._whole_ns:
                 continue
             if message.topic == SLOT_RECORD:
-                self._add_record(message, run)
+                self._add_record(message)
             elif message.topic == EVENTS:
-                values = {p.name: parameter_value(p.value) for p in bag.decode(message).changed_parameters}
-                if values:
-                    self.changes.append((slot, values))
+                changed = {p.name: p.value for p in bag.decode(message).changed_parameters}
+                if changed:
+                    values = {n: getattr(v, _PARAMETER_VALUES.get(int(v.type), ""), None) for n, v in changed.items()}
+                    self.changes.setdefault(slot, {}).update(values)
                     result.count("channel changes")
             elif message.topic.endswith("/odom"):
                 agent = message.topic.split("/")[1][2:]
                 self._odometry.append((slot, int(agent) if agent.isdigit() else 0, message.data))
 
-    def _add_record(self, message: BagMessage, run: int) -> None:
-        record = self._decode(message)
-        slot, stamp = int(record.slot), record.header.stamp
-        right = message.log_time_ns if self._partial else names.slot_time_ns(slot, self._slot_ns)
+    def _add_record(self, message: BagMessage) -> None:
+        record, mode = self._bag.decode(message), self._result.mode
+        slot, stamp, is_partial = int(record.slot), record.header.stamp, mode in (AGENT, SNIFFER)
+        right = message.log_time_ns if is_partial else names.slot_time_ns(slot, self._slot_ns)
         for what, expected, recorded in (
             ("log time", right, message.log_time_ns),
             ("publish time", right, message.publish_time_ns),
             ("stamp", right, int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)),
-            ("run", run, int(record.run)),
+            ("run", record.run if self._run is None else self._run, record.run),
             ("frame_id", names.FRAME, record.header.frame_id),
         ):
-            if expected != recorded and not (what == "run" and not run):
+            if expected != recorded:
                 why = "slots start one slot length after the other" if what != "run" else "the run's id"
-                raise Mismatch(Difference(f"slot record, {what}", str(expected), str(recorded), why, slot))
-        following = int(self.records[-1].slot) + 1 if self.records else 0
-        if slot != following and (self._whole or (self.records and not self._partial)):
+                raise Mismatch(f"slot record, {what}", expected, recorded, why, slot)
+        following = int(self.records[-1].slot) + 1 if self.records else slot if mode == MERGED else 0
+        if slot != following and not is_partial:
             if self._result.broken_off and slot > following:  # in real time records are written after other messages
                 self._whole_ns = message.log_time_ns - 1
                 return
-            why = "each slot has one record"
-            raise Mismatch(Difference("slot record", f"one of slot {following}", f"slot {slot}", why, following))
+            raise Mismatch(
+                "slot record", f"one of slot {following}", f"slot {slot}", "each slot has one record", following
+            )
         self.records.append(record)
-
-    def changes_by_slot(self) -> dict[int, dict[str, Any]]:
-        """New values of the channel's settings, by the first slot in which they hold."""
-        found: dict[int, dict[str, Any]] = {}
-        for slot, values in self.changes:
-            found.setdefault(slot, {}).update(values)
-        return found
 
     def check_odometry(self, log: FlightArrays) -> None:
         """Whether odometry is where the records say that the agents were."""
-        frames = [names.body_frame(names.agent_namespace(agent)) for agent in range(1, self._agents + 1)]
-        packer = OdometryPacker(frames, names.FRAME)
-        row = -1
-        expected: list[bytes] = []
+        bodies = [names.body_frame(names.agent_namespace(agent)) for agent in range(1, log.agents + 1)]
+        packer, packed_row, expected = OdometryPacker(bodies), -1, list[bytes]()
         for slot, agent, data in self._odometry:
-            at = slot if log.merged is None else slot - log.first_slot
-            if not (0 <= at < len(log) and 1 <= agent <= self._agents and log.known[at, agent - 1]):
+            row = slot if log.merged is None else slot - log.first_slot
+            if not (0 <= row < len(log) and 1 <= agent <= log.agents and log.known[row, agent - 1]):
                 continue
-            if at != row:
-                row = at
-                time_ns = names.slot_time_ns(slot, self._slot_ns)
-                expected = packer.pack(time_ns, log.track[at, -1], log.velocity[at])
+            if row != packed_row:
+                time_ns, packed_row = names.slot_time_ns(slot, self._slot_ns), row
+                expected = packer.pack(time_ns, log.track[row, -1], log.velocity[row])
             if data != expected[agent - 1]:
-                raise Mismatch(Difference("odometry", "the recorded position and velocity", "another message",
-                                          "odometry is the true motion", slot, agent))  # fmt: skip
+                values = "the recorded position and velocity", "another message"
+                raise Mismatch("odometry", *values, "odometry is the true motion", slot, agent)
             self._result.count("odometry")
 
     def check_digest(self) -> None:
@@ -122,14 +108,13 @@ class BagContents:
 
         :raises Mismatch: if they differ.
         """
-        if self._recorded is None:
-            self._result.skipped["digest of all messages"] = "the bag holds none: it was not closed by its recorder"
-            return
-        found = self._digest.hexdigest()
-        if found != self._recorded:
-            why = "a message was changed, left out, added or moved after the recording"
-            raise Mismatch(Difference("digest of all messages", self._recorded, found, why))
-        self._result.count("digest of all messages")
+        what, recorded, found = "digest of all messages", self._bag.custom_data.get(KEY), self._digest.hexdigest()
+        if recorded is None:
+            self._result.skipped[what] = "the bag holds none: it was not closed by its recorder"
+        elif found != recorded:
+            raise Mismatch(what, recorded, found, "a message was changed, left out, added or moved after the recording")
+        else:
+            self._result.count(what)
 
 
 def _number(bag: Bag, key: str, base: int = 10) -> int:
@@ -140,19 +125,11 @@ def _number(bag: Bag, key: str, base: int = 10) -> int:
         raise UnusableBag(bag.given, f"{key} in its metadata is no number: {bag.custom_data[key][:20]!r}") from None
 
 
-def parameter_value(value: Any) -> Any:
-    """A rcl_interfaces/ParameterValue as a plain value."""
-    fields = {1: "bool_value", 2: "integer_value", 3: "double_value", 4: "string_value"}
-    return getattr(value, fields[int(value.type)]) if int(value.type) in fields else None
-
-
 def recorded_summary(log: FlightArrays, result: Result) -> dict[str, Any]:
     """The `summary.json` beside a bag; empty without one."""
-    if result.broken_off:
-        result.skipped["summary.json"] = "the recording breaks off before the end of the flight"
-        return {}
     path = Path(str(log.file)).parent.parent / "summary.json"
-    if not path.is_file():
-        result.skipped["summary.json"] = "not beside the bag"
-        return {}
-    return dict(json.loads(path.read_text(encoding="utf-8")))
+    if not result.broken_off and path.is_file():
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    why = "the recording breaks off before the end of the flight" if result.broken_off else "not beside the bag"
+    result.skipped["summary.json"] = why
+    return {}

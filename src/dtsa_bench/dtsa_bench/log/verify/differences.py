@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,70 +13,75 @@ from dtsa_agent.core.frame import EXTENDED_LENGTH, EXTENT_M, LENGTHS, TAG_LENGTH
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.replay import DecisionDifference
 
-from .result import Difference, Mismatch
+from .result import Mismatch
 
+_MOTION = "the vehicle model under the agent's own commands"
+_CHOICE = "what the policy gives from what the agent heard"
 WHY = {
-    "known": "every agent answers every slot once",
     "length": "frames have the length of their profile, and only chosen agents send",
     "frame": "the codec's bytes of the sender's state",
     "received": "the channel's draw from its seed for this slot",
     "lost": "the channel's draw from its seed for this slot",
     "collided": "two frames in one slot destroy each other",
     "outcome": "the number of senders decides",
-    "chosen": "what the policy gives from what the agent heard",
-    "reason": "what the policy gives from what the agent heard",
+    "chosen": _CHOICE,
+    "reason": _CHOICE,
     "digest": "the agent's table after all that it heard",
     "score": "priority value g of the chosen (eq:permission_d_p_ang)",
-    "track": "the vehicle model under the agent's own commands",
-    "velocity": "the vehicle model under the agent's own commands",
+    "track": _MOTION,
+    "velocity": _MOTION,
     "command": "the avoider, from own state and estimates (eq:estimate)",
     "goal": "the scenario",
 }
 
 
-def first_difference(
-    name: str, expected: NDArray[Any], recorded: NDArray[Any], first: int, log: FlightArrays
-) -> tuple[int, Mismatch]:
-    """The first difference of arrays that have a row a slot, to the bit; the last axis is that of agents."""
-    size = expected.dtype.itemsize
-    pairs = [
-        np.ascontiguousarray(values).view(np.uint8).reshape(*values.shape, size) for values in (expected, recorded)
-    ]
-    place = tuple(int(index[0]) for index in np.nonzero((pairs[0] != pairs[1]).any(axis=-1)))
-    values = expected[place].item(), recorded[place].item()
-    row = first + place[0]
-    agent = place[-1] + 1 if len(place) > 1 else None
-    shown = [repr(value) for value in values]
-    why = WHY.get(name, "it follows from the agents' records")
-    if name == "reason":
-        shown = [_reason_text(code) for code in values]
-    if name == "chosen":
-        code = int(log.reason[row, place[-1]])
-        why = f"{why}; reason: {REASONS[code] if code < len(REASONS) else code}"
-    return row, Mismatch(Difference(name, *shown, why, row, agent))
+def first_difference(log: FlightArrays, expected: Mapping[str, NDArray[Any]], why: str = "") -> Mismatch | None:
+    """The difference in the earliest slot between a log and what its fields should be, to the bit; None: all is equal.
+
+    :param expected: arrays by the log's names; they have a row a slot, `received` a row a frame.
+    :param why: the reason of all differences; "": that of the field.
+    """
+    differences = []
+    for name, right in expected.items():
+        recorded = getattr(log, name)
+        if right.shape != recorded.shape or right.tobytes() == recorded.tobytes():
+            continue  # with other frames than expected their length differs
+        bits = [np.ascontiguousarray(values).view(np.uint8).reshape(*right.shape, -1) for values in (right, recorded)]
+        place = tuple(int(index[0]) for index in np.nonzero((bits[0] != bits[1]).any(axis=-1)))
+        row, what, reason = place[0], name, why or WHY[name]
+        if name == "received":
+            row, sender = (int(values[place[0]]) for values in log.sent_frames[:2])
+            what = f"received, frame of cf{sender}"
+        if name == "chosen":
+            reason += f"; reason: {_reason_text(int(log.reason[place]))}"
+        values = [_shown(name, values[place].item(), log) for values in (right, recorded)]
+        agent = place[-1] + 1 if len(place) > 1 else None
+        differences.append((row, Mismatch(what, *values, reason, row, agent)))
+    return min(differences, key=lambda entry: entry[0])[1] if differences else None
 
 
 def decision_difference(found: DecisionDifference, log: FlightArrays, why: str) -> Mismatch:
     """A decision of a replayed agent that is not as recorded."""
-    values: list[Any] = [found.expected, found.recorded]
-    if found.field == "frame":
-        shown = [describe_frame(data, log.config.swarm.extent_m) if data else "none" for data in values]
-    else:
-        shown = [_reason_text(code) if found.field == "reason" else repr(code) for code in values]
-    return Mismatch(Difference(found.field, *shown, why, found.slot, found.agent))
+    values = [_shown(found.field, value, log) for value in (found.expected, found.recorded)]
+    return Mismatch(found.field, *values, why, found.slot, found.agent)
+
+
+def frame_difference(expected: dict[int, bytes], recorded: dict[int, bytes], row: int, log: FlightArrays) -> Mismatch:
+    """The first frame of a slot that is not as expected; frames by the sender's id."""
+    sender = next(agent for agent in sorted({*expected, *recorded}) if expected.get(agent) != recorded.get(agent))
+    values = [_shown("frame", frames.get(sender, b""), log) for frames in (expected, recorded)]
+    return Mismatch("frame", *values, WHY["frame"], row, sender)
+
+
+def _shown(name: str, value: Any, log: FlightArrays) -> str:
+    """A value of a field in words."""
+    if name == "frame":
+        return describe_frame(value, log.config.swarm.extent_m) if value else "none"
+    return f"{value} ({_reason_text(value)})" if name == "reason" else repr(value)
 
 
 def _reason_text(code: int) -> str:
-    return f"{code} ({REASONS[code] if code < len(REASONS) else 'no reason'})"
-
-
-def frame_difference(expected: dict[int, bytes], recorded: dict[int, bytes], row: int, extent_m: float) -> Mismatch:
-    """The first frame of a slot that is not as expected; frames by the sender's id."""
-    sender = next(agent for agent in sorted({*expected, *recorded}) if expected.get(agent) != recorded.get(agent))
-    shown = [
-        describe_frame(frames[sender], extent_m) if sender in frames else "none" for frames in (expected, recorded)
-    ]
-    return Mismatch(Difference("frame", *shown, WHY["frame"], row, sender))
+    return REASONS[code] if code < len(REASONS) else "no reason"
 
 
 def describe_frame(data: bytes, extent_m: float = EXTENT_M) -> str:

@@ -11,8 +11,8 @@ from dtsa_bench.log.merge.merge import clocks_apart
 from dtsa_bench.log.merged_flight import MergedReplay, check_rules, count_unmatched_frames
 
 from .differences import decision_difference, first_difference
-from .realtime import OwnStates, check_own_states
-from .result import Difference, Mismatch, Result
+from .realtime import check_own_states
+from .result import Mismatch, Result
 
 
 def check_merged(log: FlightArrays, result: Result) -> None:
@@ -27,22 +27,22 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     result.slots, result.simulated_s = len(log), len(log) * log.config.swarm.slot_s
     result.count("slot records", len(log))
     _check_receptions(log)
-    check_own_states(log, OwnStates(log.config.swarm, result, tags=False))
+    check_own_states(log, result)
     replay = MergedReplay(log).run()
     if first := next((one for process in replay.processes for one in process.replay.differences), None):
         raise decision_difference(first, log, "follows from what the agent says to have heard")
     result.count("decisions made again", replay.equal)
     if others := about["frames_heard_not_as_sent"] + count_unmatched_frames(log):
         why = "no agent hears a frame that was not sent"
-        raise Mismatch(Difference("frames heard", "as they were sent", f"{others} others", why))
+        raise Mismatch("frames heard", "as they were sent", f"{others} others", why)
     if apart := about["not_determined"]:
-        raise Mismatch(Difference("time line", "one of all agents", f"{len(apart)} groups", clocks_apart(apart)))
+        raise Mismatch("time line", "one of all agents", f"{len(apart)} groups", clocks_apart(apart))
     rules = check_rules(log, replay.unsent)
     if about["missing"] or about["broken_off"] or about["nothing_written"]:
         result.skipped["turns"] = "bags are missing or break off: it is not known to which agents all turns were given"
     elif rules.broken:
         why = "all bags are there and whole"
-        raise Mismatch(Difference("frames in turn", "no rule broken", "; ".join(rules.broken), why))
+        raise Mismatch("frames in turn", "no rule broken", "; ".join(rules.broken), why)
     else:
         result.count("frames in turn", rules.frames)
     if log.config.swarm.auth:
@@ -63,10 +63,6 @@ def _check_receptions(log: FlightArrays) -> None:
     :raises Mismatch: at the first difference.
     """
     for part, (received, lost, outcome) in zip(log.parts, receptions_of(log), strict=True):
-        for name, expected in (("outcome", outcome), ("lost", lost), ("collided", np.zeros_like(lost))):
-            if expected.tobytes() != getattr(part, name).tobytes():
-                raise first_difference(name, expected, getattr(part, name), 0, part)[1]
-        if wrong := np.flatnonzero((part.received != received).any(axis=1)).tolist():
-            row, sender = (int(values[wrong[0]]) for values in part.sent_frames[:2])
-            why = "it follows from what the agents heard"
-            raise Mismatch(Difference("received", "what the agents say", "another mask", why, row, sender))
+        expected = {"outcome": outcome, "lost": lost, "collided": np.zeros_like(lost), "received": received}
+        if mismatch := first_difference(part, expected, "it follows from what the agents heard"):
+            raise mismatch

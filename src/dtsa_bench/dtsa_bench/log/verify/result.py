@@ -21,17 +21,27 @@ class Difference:
     agent: int | None = None  # id
 
     def __str__(self) -> str:
-        places = [f"{name} {place}" for name, place in (("slot", self.slot), ("agent", self.agent)) if place is not None]
+        places = [
+            f"{name} {place}" for name, place in (("slot", self.slot), ("agent", self.agent)) if place is not None
+        ]
         where = f"{', '.join(places)}: " if places else ""
         return f"{where}{self.what}: expected {self.expected}, recorded {self.recorded} ({self.reason})"
 
 
 class Mismatch(Exception):
-    """Carries the first difference out of nested checks."""
+    """Carries the first difference out of nested checks; arguments are those of :class:`Difference`."""
 
-    def __init__(self, difference: Difference) -> None:
-        super().__init__(str(difference))
-        self.difference = difference
+    def __init__(
+        self,
+        what: str,
+        expected: object,
+        recorded: object,
+        reason: str,
+        slot: int | None = None,
+        agent: int | None = None,
+    ) -> None:
+        self.difference = Difference(what, str(expected), str(recorded), reason, slot, agent)
+        super().__init__(str(self.difference))
 
 
 @dataclass(slots=True, repr=False)
@@ -93,7 +103,7 @@ class Result:
             return
         if rules.broken:
             why = "a turn is its owner's, or of the last agent that was given it (docs/reference/protocol.md)"
-            raise Mismatch(Difference("frames", "none against the rules", "; ".join(rules.broken[:3]), why))
+            raise Mismatch("frames", "none against the rules", "; ".join(rules.broken[:3]), why)
         self.count("slots whose frames keep to the rules", rules.slots)
         if rules.unchecked:
             why = "they may depend on frames that were too late to be sent, and are in no record"

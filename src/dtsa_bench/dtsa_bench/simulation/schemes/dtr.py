@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.plugins.kinds import PacketRadio, Table
+from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_bench.simulation.unslotted import Radio
 
 _MOST_AGENTS = 20  # MAX_NETWORK_SIZE
 _HEADER = 5  # bytes: size of the packet, kind, source, target, size of the data
@@ -50,7 +51,7 @@ class Dtr:
         """The id that follows another one in the ring."""
         return agent % self._count + 1
 
-    def wake(self, table: Table, now_ns: int, radio: PacketRadio) -> int:
+    def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
         """Sends what is due."""
         if not self._begun:
             self._begun = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.plugins.kinds import Table
+from dtsa_agent.core.plugins.entry_points import Table
 
 from .knowledge import has_arrived
 

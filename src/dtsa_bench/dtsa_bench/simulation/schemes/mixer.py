@@ -6,7 +6,8 @@ import numpy as np
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.plugins.kinds import PacketRadio, Table
+from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_bench.simulation.unslotted import Radio
 from dtsa_channel_sim.model.airtime import Airtime
 
 #: us between packets that are no airtime; an assumption.
@@ -91,7 +92,7 @@ class Mixer:
         self._heard = FrameSolver()
         self._said = self._news = False  # in this round: a packet sent; something heard and not taken in yet
 
-    def wake(self, table: Table, now_ns: int, radio: PacketRadio) -> int:
+    def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
         """Begins rounds, sends in its own slots, and takes frames in when a round is over."""
         if now_ns > self._due_ns + 1:  # it was switched off, and waits for the next round
             self._round, self._due_ns = -1, (now_ns // self.period_ns + 1) * self.period_ns
@@ -116,7 +117,7 @@ class Mixer:
     def _over(self, now_ns: int) -> bool:
         return self._round >= 0 and now_ns - self._round * self.period_ns >= self.round_ns
 
-    def _act(self, radio: PacketRadio) -> None:
+    def _act(self, radio: Radio) -> None:
         number, since_ns = divmod(self._due_ns, self.period_ns)
         if since_ns == 0:
             self._round, self._said, self._news, self._heard = number, False, False, FrameSolver()

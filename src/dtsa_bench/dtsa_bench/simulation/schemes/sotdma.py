@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.plugins.kinds import Table
+from dtsa_agent.core.plugins.entry_points import Table
 from dtsa_agent.core.swarm import SlotOutcome
 
 _TIMEOUTS = (3, 8)  # frames of reports a slot is kept for: drawn from 3 to 7

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dtsa_agent.core.reference.frame_extended import OPEN
+from dtsa_agent.core.reference.frame import OPEN
 from dtsa_agent.core.reference.table import Rules
 
 DEAF = 4  # more silent slots in a row than this, and an agent is presumed deaf
@@ -30,6 +30,7 @@ class Memory:
     """
 
     rules: Rules
+    me: int = 0  # index of the agent itself
     started: bool = False
     born: int = 0  # slot of the first decision
     now: int = 0  # the present slot
@@ -104,7 +105,7 @@ class Memory:
             return -1
         return owner
 
-    def note(self, self_index: int, slot: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
+    def note(self, slot: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
         """Note what a frame says of a turn.
 
         The lessee may hand the turn on, in a frame of its own; what is relayed later changes nothing. So a turn can
@@ -117,7 +118,7 @@ class Memory:
         """
         if not self.now < turn < self.now + self.window or self.is_main(turn):
             return
-        entry, mine = self.leases.get(turn), lessee == self_index + 1
+        entry, mine = self.leases.get(turn), lessee == self.me + 1
         if entry is None:
             self.leases[turn] = Lease(lessee, issuer)
         elif lessee == entry.lessee:
@@ -127,7 +128,7 @@ class Memory:
                 entry.lessee = lessee
             elif slot > self.spoke:
                 self.leases[turn] = Lease(lessee, 0)
-        elif entry.issuer not in (0, issuer, self_index + 1, HANDED) and issuer and lessee < entry.lessee:
+        elif entry.issuer not in (0, issuer, self.me + 1, HANDED) and issuer and lessee < entry.lessee:
             self.leases[turn] = Lease(lessee, issuer)
 
     def turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
@@ -161,9 +162,9 @@ class Memory:
             self.probation = True
             self.woke = slot
 
-    def roll(self, self_index: int, slot: int) -> None:
+    def roll(self, slot: int) -> None:
         """A slot begins: earlier turns are over; the estimate of how many woke falls."""
         for turn in [turn for turn in self.leases if turn < slot]:
             del self.leases[turn]
-        self.now = self.heard[self_index] = slot
+        self.now = self.heard[self.me] = slot
         self.wakers -= self.wakers / self.rules.agents

@@ -6,10 +6,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
+from typing import NamedTuple
 
 from dtsa_channel_sim.model.airtime import OVERHEAD_BITS
 from dtsa_channel_sim.model.config import ChannelConfig
 from dtsa_channel_sim.model.medium import Medium, OnAir
+
+from .receiver import RadioReceiver
 
 BITRATES = {"250K": 250_000, "1M": 1_000_000, "2M": 2_000_000}
 RATE_NAMES = tuple(BITRATES)  # by the number of the dongle's request SET_DATA_RATE
@@ -41,9 +44,12 @@ def retry_delay_ns(ard: int, rate: str) -> int:
     return _ARD_STEP_NS * (steps + 1)
 
 
-def between_crazyflies(packet: bytes) -> bool:
-    """Whether a packet is peer-to-peer: the radio chip does not take it for the ground station's."""
-    return len(packet) > 1 and packet[0] & PEER_HEAD == PEER_HEAD and packet[1] & 0xF0 == PEER_PORT
+class Tuning(NamedTuple):
+    """To what a dongle is tuned."""
+
+    channel: int
+    rate: str
+    addresses: tuple[bytes, bytes]  # of its pipes; the second one is for sniffer mode
 
 
 class Agenda:
@@ -76,10 +82,18 @@ class RadioAir:
     """
 
     def __init__(self, radios: int, loss: float, seed: int) -> None:
+        self.agenda = Agenda()
+        self.receivers: dict[int, RadioReceiver] = {}  # of Crazyflies, by id
+        #: Of dongles, by id: receive an address, a packet to it, the tuning of its sender and its time on the air.
+        self.sniffers: dict[int, Callable[[bytes, bytes, Tuning, OnAir], None]] = {}
+        #: Whether a packet to (True) or from a Crazyflie (id) passes the faults of its link.
+        self.passes: Callable[[int, bool], bool] = lambda radio, up: True
+        #: Receives what a dongle sent as between Crazyflies, ids of its receivers, its tuning and its time on the air.
+        self.peer_packet: Callable[[bytes, set[int], Tuning, OnAir], None] = lambda *_: None
         self._config = ChannelConfig(agents=radios, loss=loss, seed=seed)
         self._medium = Medium(self._config)
         self._by_channel: dict[int, list[OnAir]] = {}
-        self._judged = 0  # each transmission has random numbers of its own
+        self._resolved = 0  # each transmission has random numbers of its own
 
     def set_loss(self, loss: float) -> None:
         """From now on another share of packets is lost to noise."""
@@ -97,7 +111,32 @@ class RadioAir:
 
     def receivers_of(self, channel: int, frame: OnAir) -> set[int]:
         """Ids of the radios that can decode a transmission that has ended, if they listen."""
-        self._judged += 1
+        self._resolved += 1
         others = [f for f in self._by_channel[channel] if f is not frame and f.end_ns > frame.start_ns]
-        received = self._medium.resolve(self._judged, frame, others).received
+        received = self._medium.resolve(self._resolved, frame, others).received
         return {int(index) + 1 for index in received.nonzero()[0]}
+
+    def reached(self, heard: set[int], tuning: Tuning, address: bytes) -> list[tuple[int, RadioReceiver]]:
+        """Crazyflies that have a packet to an address, of those that can decode it, and their ids."""
+        found = []
+        for radio in heard & self.receivers.keys():
+            station = self.receivers[radio].station
+            listens = (station.channel, station.rate) == tuning[:2] and address in (station.address, BROADCAST)
+            if listens and self.passes(radio, True):
+                found.append((radio, self.receivers[radio]))
+        return found
+
+    def sniff(self, heard: set[int], address: bytes, packet: bytes, tuning: Tuning, frame: OnAir) -> None:
+        """Dongles in sniffer mode have a packet."""
+        for radio in sorted(heard & self.sniffers.keys()):
+            self.sniffers[radio](address, packet, tuning, frame)
+
+    def broadcast(self, address: bytes, packet: bytes, tuning: Tuning, frame: OnAir) -> None:
+        """A packet that a dongle in sniffer mode has sent has left the air."""
+        heard = self.receivers_of(tuning.channel, frame)
+        self.sniff(heard, address, packet, tuning, frame)
+        if len(packet) > 1 and packet[0] & PEER_HEAD == PEER_HEAD and packet[1] & 0xF0 == PEER_PORT:
+            self.peer_packet(packet, heard, tuning, frame)  # the radio chip does not take it for the ground station's
+        else:
+            for _, receiver in self.reached(heard, tuning, address):
+                receiver.receive_broadcast(packet, frame.end_ns / 1e9)

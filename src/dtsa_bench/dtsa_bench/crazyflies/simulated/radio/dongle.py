@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from dtsa_bench.crazyflies.simulated.fleet_config import DEVICES, RadioSettings
 from dtsa_channel_sim.model.medium import OnAir
 
-from .air import BROADCAST, MAX_PAYLOAD, RATE_NAMES, Agenda, RadioAir, between_crazyflies, retry_delay_ns
-from .receiver import RadioReceiver
-from .sniffer_mode import FIRST_FIRMWARE, SnifferMode, Tuned
+from .air import BROADCAST, MAX_PAYLOAD, RATE_NAMES, RadioAir, Tuning, retry_delay_ns
+from .sniffer_mode import FIRST_FIRMWARE, SnifferMode
 
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_POWER, SET_ARD, SET_ARC = range(1, 7)
 ACK_ENABLE = 0x10
@@ -30,86 +29,58 @@ class _Transfer:
     packet: bytes
     answer: Callable[[bytes], None]
     acknowledged: bool  # wanted
-    rate: str = ""
     retries: int = 0
-    reply: tuple[OnAir, bytes] | None = None  # the acknowledgement to this dongle
 
 
 class DongleModel:
-    """One Crazyradio; radios are named by their ids on the air. It adds its own sniffer to those of all dongles.
+    """One Crazyradio; `radio` is its id on the air. Its sniffer joins the air's."""
 
-    :param passes: says whether a packet to (True) or from a Crazyflie passes the faults of its link.
-    """
-
-    def __init__(
-        self,
-        radio: int,
-        settings: RadioSettings,
-        air: RadioAir,
-        agenda: Agenda,
-        receivers: dict[int, RadioReceiver],
-        passes: Callable[[int, bool], bool],
-        sniffers: dict[int, SnifferMode],
-    ) -> None:
-        self._radio, self._settings, self._air, self._agenda = radio, settings, air, agenda
-        self._receivers, self._passes = receivers, passes
-        self.packets = 0  # transfers since the start
+    def __init__(self, radio: int, settings: RadioSettings, air: RadioAir) -> None:
+        self._radio, self._settings, self._air, self._agenda = radio, settings, air, air.agenda
+        self._half_ns = round(settings.usb_ms * 0.5e6)  # of a packet on USB, one way
         self._busy_ns = 0
-        self.sniffer = SnifferMode(radio, air, agenda, round(settings.usb_ms * 0.5e6), settings.seed)
-        self.sniffer.arrived = self._broadcast
-        sniffers[radio] = self.sniffer
-        #: Takes a packet as between vehicles, ids of those that hear it, and how it was sent: for apps on board.
-        self.between: Callable[[bytes, set[int], Tuned, OnAir], None] = lambda *_: None
-        self._sniffers = sniffers
+        self.sniffer = SnifferMode(radio, air, self._half_ns, settings.seed)
+        air.sniffers[radio] = self.sniffer.receive
         self.reset()
 
     def reset(self) -> None:
         """As after plugging in."""
-        self._channel, self._rate, self._address = 2, "2M", b"\xe7" * 5
-        self._second = b"\xc2" * 5  # address of the second pipe in sniffer mode
+        self._tuning = Tuning(2, "2M", (b"\xe7" * 5, b"\xc2" * 5))
         self._ard, self._arc, self._ack = 0xA0, 3, True
         self.sniffer.stop()
 
     def request(self, number: int, value: int, index: int, data: bytes, now: int) -> None:
         """A vendor request from the host; what is not known is ignored."""
         self._busy_ns = max(now, self._busy_ns) + round(self._settings.request_ms * 1e6)
+        first, second = self._tuning.addresses
         if number == SET_CHANNEL and value <= 125:
-            self._channel = value
-        elif number == SET_ADDRESS and len(data) == 5:
-            self._address = bytes(data)
+            self._tuning = self._tuning._replace(channel=value)
         elif number == SET_RATE and value < len(RATE_NAMES):
-            self._rate = RATE_NAMES[value]
+            self._tuning = self._tuning._replace(rate=RATE_NAMES[value])
+        elif number in (SET_ADDRESS, SET_SNIFFER_ADDRESS) and len(data) == 5:
+            if number == SET_ADDRESS or value == 0:
+                self._tuning = self._tuning._replace(addresses=(data, second))
+            elif value == 1:
+                self._tuning = self._tuning._replace(addresses=(first, data))
         elif number == SET_ARD:
             self._ard = value & 0xFF
         elif number == SET_ARC:
             self._arc = value & 0x0F
         elif number == ACK_ENABLE:
             self._ack = bool(value)
-        elif number == SET_SNIFFER_ADDRESS and len(data) == 5:
-            if value == 0:
-                self._address = bytes(data)
-            elif value == 1:
-                self._second = bytes(data)
         elif number == SET_RADIO_MODE and DEVICES[self._settings.device] >= FIRST_FIRMWARE:
-            self._set_mode(value, now)
-        if self.sniffer.tuned is not None:
-            self.sniffer.tuned = self._tuned
-
-    @property
-    def _tuned(self) -> Tuned:
-        return Tuned(self._channel, self._rate, (self._address, self._second))
-
-    def _set_mode(self, mode: int, now: int) -> None:
-        if mode == 0:
-            self.sniffer.stop()
-        elif mode == 1 and self.sniffer.tuned is None:
-            self.sniffer.start(now, self._tuned)
+            if value == 0:
+                self.sniffer.stop()
+            elif value == 1 and self.sniffer.tuning is None:
+                self.sniffer.start(now, self._tuning)
+        if self.sniffer.tuning is not None:
+            self.sniffer.tuning = self._tuning
 
     @property
     def _can_send(self) -> bool:
         device = self._settings.device
-        slow = self._rate == "250K" and device == "2"  # a Crazyradio 2.0 cannot
-        return not (slow or self._channel > HIGHEST_CHANNEL[device])
+        slow = self._tuning.rate == "250K" and device == "2"  # a Crazyradio 2.0 cannot
+        return not (slow or self._tuning.channel > HIGHEST_CHANNEL[device])
 
     # -- a packet ---------------------------------------------------------------------------------------------------
     def transfer(self, packet: bytes, now: int, answer: Callable[[bytes], None]) -> None:
@@ -117,13 +88,11 @@ class DongleModel:
 
         In sniffer mode a packet begins with the address to which it goes.
         """
-        self.packets += 1
-        if self.sniffer.tuned is not None:
+        if self.sniffer.tuning is not None:
             if self._can_send:
                 self.sniffer.order(packet, now)
             return
-        half = round(self._settings.usb_ms * 0.5e6)
-        start = max(now, self._busy_ns) + half
+        start = max(now, self._busy_ns) + self._half_ns
         if self._ack:
             parts = [packet[:MAX_PAYLOAD]]
         elif len(packet) > MAX_PAYLOAD:  # two of the same length
@@ -132,91 +101,62 @@ class DongleModel:
             parts = [packet]
         if not self._can_send:
             if self._ack:  # a Crazyradio 2.0 reports that no answer came
-                self._finish(_Transfer(packet, answer, True), start, b"\0")
+                self._finish(answer, start, b"\0")
             return
         for part in parts:
             start = self._attempt(_Transfer(part, answer, self._ack), start)
         self._busy_ns = start
 
     def _attempt(self, transfer: _Transfer, start: int) -> int:
-        frame = self._air.send(self._channel, self._rate, self._radio, start, len(transfer.packet))
-        channel, rate, address = self._channel, self._rate, self._address
-        transfer.rate = rate
-        self._agenda.at(frame.end_ns, lambda: self._arrived(transfer, frame, channel, rate, address))
+        tuning = self._tuning
+        frame = self._air.send(tuning.channel, tuning.rate, self._radio, start, len(transfer.packet))
+        self._agenda.at(frame.end_ns, lambda: self._arrived(transfer, frame, tuning))
         return frame.end_ns
 
-    def _arrived(self, transfer: _Transfer, frame: OnAir, channel: int, rate: str, address: bytes) -> None:
+    def _arrived(self, transfer: _Transfer, frame: OnAir, tuning: Tuning) -> None:
         """Find the receivers of a packet that has left the air."""
-        heard = self._air.receivers_of(channel, frame)
-        self.overheard(heard, address, transfer.packet, channel, rate, frame)
+        heard, address = self._air.receivers_of(tuning.channel, frame), tuning.addresses[0]
+        self._air.sniff(heard, address, transfer.packet, tuning, frame)
         seconds = frame.end_ns / 1e9
         replies = []
-        for radio, receiver in self._reached(heard, channel, rate, address):
+        for radio, receiver in self._air.reached(heard, tuning, address):
             if address == BROADCAST:
                 receiver.receive_broadcast(transfer.packet, seconds)
             else:
                 payload = receiver.receive(transfer.packet, seconds)
-                replies.append((self._air.send(channel, rate, radio, frame.end_ns, len(payload)), radio, payload))
+                reply = self._air.send(tuning.channel, tuning.rate, radio, frame.end_ns, len(payload))
+                replies.append((reply, radio, payload))
         if not transfer.acknowledged:
             return
-        late = frame.end_ns + self._patience_ns(rate)
-        over = max([late, *(reply.end_ns for reply, _, _ in replies)]) if replies else late
-        first = min((reply.end_ns for reply, _, _ in replies), default=over)
+        device = self._settings.device
+        over = frame.end_ns + (ACK_TIMEOUT_NS if device == "2" else retry_delay_ns(self._ard, tuning.rate))
+        over = max([over, *(reply.end_ns for reply, _, _ in replies)])
         if len(replies) == 1:
             reply, radio, payload = replies[0]
-            self._agenda.at(first, lambda: self._answered(transfer, reply, radio, payload, channel, over))
+            self._agenda.at(reply.end_ns, lambda: self._answered(transfer, reply, radio, payload, tuning, over))
         else:
             self._agenda.at(over, lambda: self._missed(transfer, over))
 
-    def _reached(self, heard: set[int], channel: int, rate: str, address: bytes) -> list[tuple[int, RadioReceiver]]:
-        """Crazyflies that have a packet, and their ids on the air."""
-        found = []
-        for radio in heard & self._receivers.keys():
-            receiver = self._receivers[radio]
-            station = receiver.station
-            tuned = station.channel == channel and station.rate == rate and address in (station.address, BROADCAST)
-            if tuned and self._passes(radio, True):
-                found.append((radio, receiver))
-        return found
-
-    def overheard(self, heard: set[int], address: bytes, packet: bytes, channel: int, rate: str, frame: OnAir) -> None:
-        """Dongles in sniffer mode have a packet."""
-        for radio in sorted(heard & self._sniffers.keys()):
-            tuned = self._sniffers[radio].tuned
-            if tuned is not None and (tuned.channel, tuned.rate) == (channel, rate):
-                self._sniffers[radio].receive(address, packet, frame)
-
-    def _broadcast(self, address: bytes, packet: bytes, tuned: Tuned, frame: OnAir) -> None:
-        """A packet that this dongle has sent in sniffer mode has left the air."""
-        heard = self._air.receivers_of(tuned.channel, frame)
-        self.overheard(heard, address, packet, tuned.channel, tuned.rate, frame)
-        if between_crazyflies(packet):
-            self.between(packet, heard, tuned, frame)
-        else:
-            for _, receiver in self._reached(heard, tuned.channel, tuned.rate, address):
-                receiver.receive_broadcast(packet, frame.end_ns / 1e9)
-
-    def _patience_ns(self, rate: str) -> int:
-        return ACK_TIMEOUT_NS if self._settings.device == "2" else retry_delay_ns(self._ard, rate)
-
-    def _answered(self, transfer: _Transfer, reply: OnAir, radio: int, payload: bytes, channel: int, over: int) -> None:
+    def _answered(
+        self, transfer: _Transfer, reply: OnAir, radio: int, payload: bytes, tuning: Tuning, over: int
+    ) -> None:
         """The acknowledgement has left the air."""
-        heard = self._air.receivers_of(channel, reply)
-        self.overheard(heard, self._receivers[radio].station.address, payload, channel, transfer.rate, reply)
-        if self._radio in heard and self._passes(radio, False):
+        heard = self._air.receivers_of(tuning.channel, reply)
+        self._air.sniff(heard, self._air.receivers[radio].station.address, payload, tuning, reply)
+        if self._radio in heard and self._air.passes(radio, False):
             status = transfer.retries << 4 | POWER_DETECTED | ACKNOWLEDGED
-            self._finish(transfer, reply.end_ns, bytes((status,)) + payload)
+            self._finish(transfer.answer, reply.end_ns, bytes((status,)) + payload)
         else:
             self._agenda.at(over, lambda: self._missed(transfer, over))
 
     def _missed(self, transfer: _Transfer, now: int) -> None:
         if transfer.retries >= self._arc:
-            self._finish(transfer, now, b"\0")
+            self._finish(transfer.answer, now, b"\0")
         else:
             transfer.retries += 1
             self._attempt(transfer, now)
 
-    def _finish(self, transfer: _Transfer, now: int, data: bytes) -> None:
-        done = now + round(self._settings.usb_ms * 0.5e6)
+    def _finish(self, answer: Callable[[bytes], None], now: int, data: bytes) -> None:
+        done = now + self._half_ns
         self._busy_ns = max(self._busy_ns, done)
-        self._agenda.at(done, lambda: transfer.answer(data))
+        self._agenda.at(done, lambda: answer(data))

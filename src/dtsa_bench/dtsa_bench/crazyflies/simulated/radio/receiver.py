@@ -26,32 +26,26 @@ class RadioReceiver:
     def __init__(self, station: RadioAddress, deliver: Callable[[bytes, float], None]) -> None:
         self.station = station
         self._deliver = deliver
-        self.last_heard = float("-inf")  # s
         #: Called with the time (s) of each packet: it goes over the line to the flight processor.
         self.on_packet: Callable[[float], None] = lambda t: None
-        self._queue: deque[bytes] = deque()
-        self._reset_link()
+        self.reset()
 
-    def _reset_link(self) -> None:
+    def reset(self) -> None:
+        """Power on."""
+        self.last_heard = float("-inf")  # s
+        self._queue: deque[bytes] = deque()
         self._chip: deque[bytes] = deque()
         self._safelink = False
         self._up = self._down = True
         self._sent = b""  # payload of the last acknowledgement
         self._sent_from_chip = False
 
-    def reset(self) -> None:
-        """Power on."""
-        self._queue.clear()
-        self._reset_link()
-        self.last_heard = float("-inf")
-
     def connected(self, t: float) -> bool:
-        """Whether a packet came in the last second (t: s)."""
-        return t - self.last_heard < ACTIVITY_S
-
-    def clear(self) -> None:
-        """Nobody is there: what waits is forgotten."""
+        """Whether a packet came in the last second (t: s); if not, what waits is forgotten."""
+        if t - self.last_heard < ACTIVITY_S:
+            return True
         self._queue.clear()
+        return False
 
     def push(self, packet: bytes) -> None:
         """A packet for the ground station; lost if too many wait."""

@@ -21,36 +21,38 @@ import struct
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.simulated.fleet_config import DEVICES, RadioSettings
 
-from .air import Agenda, RadioAir
+from .air import RadioAir
 from .dongle import DongleModel
 from .receiver import RadioReceiver
-from .sniffer_mode import SnifferMode
 
 LIST, CLAIM, REQUEST, PACKET, READ, DROPPED = range(6)
 _REQUEST = struct.Struct("<BBHH")
 _LONGEST = 128
-_PATIENCE_S = 0.05
 
 
 @dataclass(slots=True, eq=False)
-class RadioHost:
+class _Host:
     """A host's connection."""
 
     socket: socket.socket
     dongle: int | None = None
 
+    def send(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):  # a host that has gone
+            self.socket.send(data)
+
 
 class RadioServer:
-    """Dongles, air and receivers. Hosts may connect at once, or after `listen`.
+    """Dongles, air and receivers.
 
     :param deliver: gets a vehicle's index, a packet for it and the time (s).
     :param passes: index and direction (True: up): whether a packet passes the faults of a vehicle's link.
-    :raises ConfigError: the socket cannot be made.
     """
 
     def __init__(
@@ -58,134 +60,114 @@ class RadioServer:
         settings: RadioSettings,
         deliver: Callable[[int, bytes, float], None],
         passes: Callable[[int, bool], bool],
-        *,
-        listen: bool = True,
     ) -> None:
         self.settings = settings
         self.origin_ns = time.monotonic_ns()
-        self.listener: socket.socket | None = None
-        self.agenda = Agenda()
-        first = settings.dongles + 1
+        first = self.first = settings.dongles + 1  # id on the air of the first vehicle
         self.receivers = [
-            RadioReceiver(station, lambda packet, t, index=index: deliver(index, packet, t))  # type: ignore[misc]
-            for index, station in enumerate(settings.stations)
+            RadioReceiver(station, partial(deliver, index)) for index, station in enumerate(settings.stations)
         ]
-        by_id = {first + index: receiver for index, receiver in enumerate(self.receivers)}
-        air = self.air = RadioAir(settings.dongles + len(by_id), settings.loss, settings.seed)
-        #: Id on the air of the first vehicle.
-        self.first = first
-        sniffers: dict[int, SnifferMode] = {}
-        self.dongles = [
-            DongleModel(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up), sniffers)
-            for k in range(1, first)
-        ]
-        self._taken: set[int] = set()
-        self._gone: set[int] = set()  # dongles that are pulled
-        self._hosts: list[RadioHost] = []
-        if listen:
-            self.listen()
+        self.air = RadioAir(settings.dongles + len(self.receivers), settings.loss, settings.seed)
+        self.air.receivers = dict(enumerate(self.receivers, first))
+        self.air.passes = lambda radio, up: passes(radio - first, up)
+        self.dongles = [DongleModel(radio, settings, self.air) for radio in range(1, first)]
+        self._listener: socket.socket | None = None
+        self._selector: selectors.BaseSelector
+        self._hosts: list[_Host] = []
+        self._unplugged: set[int] = set()
 
-    def listen(self) -> None:
-        """Hosts may connect, and the fleet's time begins; ConfigError: the socket cannot be made."""
-        self.listener = _listen(self.settings.path)
+    def listen(self, selector: selectors.BaseSelector) -> None:
+        """Hosts may connect, and the fleet's time begins; ConfigError: the socket cannot be made.
+
+        :param selector: learns of hosts that come and go; the data of what is ready is to be called.
+        """
+        self._selector, self._listener = selector, _listen(self.settings.path)
+        selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self.origin_ns = time.monotonic_ns()
 
     def now_ns(self) -> int:
         """The fleet's time."""
         return time.monotonic_ns() - self.origin_ns
 
-    def serve_host(self, host: RadioHost | None, selector: selectors.BaseSelector) -> None:
-        """Receive what has come from a host (None: a new one); the selector learns of hosts that come and go."""
-        if host is None:
-            assert self.listener is not None
-            with contextlib.suppress(OSError):
-                connection = self.listener.accept()[0]
-                connection.setblocking(False)
-                self._hosts.append(RadioHost(connection))
-                selector.register(connection, selectors.EVENT_READ, self._hosts[-1])
-            return
-        sock = host.socket
-        if not self._serve(host):
-            selector.unregister(sock)
+    def _accept(self) -> None:
+        assert self._listener is not None
+        with contextlib.suppress(OSError):
+            host = _Host(self._listener.accept()[0])
+            host.socket.setblocking(False)
+            self._hosts.append(host)
+            self._selector.register(host.socket, selectors.EVENT_READ, partial(self._serve, host))
 
-    def _serve(self, host: RadioHost) -> bool:
-        """Take what a host has sent; False when it has gone."""
+    def _serve(self, host: _Host) -> None:
+        """Receive what a host has sent."""
         try:
             message = host.socket.recv(_LONGEST)
         except BlockingIOError:
-            return True
+            return
         except OSError:
             message = b""
         if not message:
-            self.leave(host)
-            return False
-        kind = message[0]
-        if kind == LIST:
+            self._disconnect(host)
+        elif message[0] == LIST:
             version = DEVICES[self.settings.device]
-            versions = [0 if k in self._gone else version for k in range(len(self.dongles))]
-            _send(host, struct.pack(f">{len(versions)}H", *versions))
-        elif kind == CLAIM and len(message) == 2:
-            _send(host, bytes((self._claim(host, message[1]),)))
+            versions = [0 if k in self._unplugged else version for k in range(len(self.dongles))]
+            host.send(struct.pack(f">{len(versions)}H", *versions))
+        elif message[0] == CLAIM and len(message) == 2:
+            number, taken = message[1], {other.dongle for other in self._hosts}
+            free = number < len(self.dongles) and number not in taken | self._unplugged
+            host.dongle = number if free else host.dongle
+            host.send(bytes((free,)))
         elif host.dongle is not None:
             self._use(self.dongles[host.dongle], host, message)
-        return True
 
-    def _claim(self, host: RadioHost, number: int) -> bool:
-        if number >= len(self.dongles) or number in self._taken | self._gone:
-            return False
-        self._taken.add(number)
-        host.dongle = number
-        return True
-
-    def _use(self, dongle: DongleModel, host: RadioHost, message: bytes) -> None:
+    def _use(self, dongle: DongleModel, host: _Host, message: bytes) -> None:
         kind = message[0]
         if kind == REQUEST and len(message) >= _REQUEST.size:
             _, number, value, index = _REQUEST.unpack_from(message)
             dongle.request(number, value, index, message[_REQUEST.size :], self.now_ns())
         elif kind == PACKET and len(message) > 1:
-            dongle.transfer(message[1:], self.now_ns(), lambda data: _send(host, data))
+            dongle.transfer(message[1:], self.now_ns(), host.send)
         elif kind == READ:
-            dongle.sniffer.give = lambda data: _send(host, bytes((PACKET,)) + data)
+            dongle.sniffer.give = lambda data: host.send(bytes((PACKET,)) + data)
             dongle.sniffer.read()
         elif kind == DROPPED:
-            _send(host, struct.pack("<BI", DROPPED, dongle.sniffer.dropped))
+            host.send(struct.pack("<BI", DROPPED, dongle.sniffer.dropped))
 
     def unplug(self, number: int) -> None:
         """Pull a dongle, whichever host has it."""
-        self._gone.add(number)
+        self._unplugged.add(number)
         for host in self._hosts:
             if host.dongle == number:
                 with contextlib.suppress(OSError):
-                    host.socket.shutdown(socket.SHUT_RDWR)  # `take` sees it go
+                    host.socket.shutdown(socket.SHUT_RDWR)  # `_serve` sees it go
 
     def plug_in(self) -> None:
-        """All dongles are there."""
-        self._gone.clear()
+        """All dongles are plugged in."""
+        self._unplugged.clear()
 
-    def leave(self, host: RadioHost) -> None:
+    def _disconnect(self, host: _Host) -> None:
         """A host goes; its dongle is free again."""
+        self._selector.unregister(host.socket)
         host.socket.close()
-        if host in self._hosts:
-            self._hosts.remove(host)
+        self._hosts.remove(host)
         if host.dongle is not None:
-            self._taken.discard(host.dongle)
             self.dongles[host.dongle].reset()
-            host.dongle = None
 
-    def wait_s(self) -> float | None:
-        """How long until something is due; None: nothing is."""
-        due = self.agenda.next_ns
-        return None if due is None else max(0.0, (due - self.now_ns()) / 1e9)
+    def wait_s(self, longest: float) -> float:
+        """How long until something is due, at most so long (s)."""
+        due = self.air.agenda.next_ns
+        return longest if due is None else min(longest, max(0.0, (due - self.now_ns()) / 1e9))
 
     def run(self) -> None:
         """Do what is due."""
-        self.agenda.run(self.now_ns())
+        self.air.agenda.run(self.now_ns())
 
     def close(self) -> None:
-        """The socket goes."""
-        if self.listener is None:
+        """The socket goes, and all hosts with it."""
+        if self._listener is None:
             return
-        self.listener.close()
+        for host in [*self._hosts]:
+            self._disconnect(host)
+        self._listener.close()
         if self.settings.path is not None:
             self.settings.path.unlink(missing_ok=True)
 
@@ -207,39 +189,3 @@ def _listen(path: Path | None) -> socket.socket:
     listener.listen(32)
     listener.setblocking(False)
     return listener
-
-
-def _send(host: RadioHost, data: bytes) -> None:
-    with contextlib.suppress(OSError):  # a host that has gone
-        host.socket.send(data)
-
-
-class DongleServer:
-    """Simulated Crazyradios on an air of their own, without Crazyflies: serves the hosts that connect to the socket.
-
-    :raises ConfigError: the socket cannot be made.
-    """
-
-    def __init__(self, settings: RadioSettings) -> None:
-        self.server = RadioServer(settings, lambda index, packet, t: None, lambda index, up: True)
-        self._stopped = False
-
-    def stop(self) -> None:
-        """End :meth:`run`; also from a signal's handler."""
-        self._stopped = True
-
-    def run(self) -> None:
-        """Serve until it is stopped."""
-        selector = selectors.SelectSelector()  # waits to the microsecond; epoll to the millisecond
-        selector.register(self.server.listener, selectors.EVENT_READ, None)
-        try:
-            while not self._stopped:
-                due = self.server.wait_s()
-                for key, _ in selector.select(_PATIENCE_S if due is None else min(due, _PATIENCE_S)):
-                    self.server.serve_host(key.data, selector)
-                self.server.run()
-        finally:
-            for key in list(selector.get_map().values()):
-                if key.data is not None:
-                    self.server.leave(key.data)
-            self.server.close()

@@ -12,11 +12,10 @@ import random
 import struct
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 from dtsa_channel_sim.model.medium import OnAir
 
-from .air import MAX_SNIFFED, TURN_NS, Agenda, RadioAir
+from .air import MAX_SNIFFED, TURN_NS, RadioAir, Tuning
 
 FIRST_FIRMWARE = 0x0504  # that has this mode
 ADDRESS = 5  # bytes before the payload of a packet that is to be sent
@@ -31,30 +30,21 @@ _RSSI = 45  # -dBm
 _MOST_DRIFT = 20e-6  # of its crystal
 
 
-class Tuned(NamedTuple):
-    """To what a dongle is tuned."""
-
-    channel: int
-    rate: str
-    addresses: tuple[bytes, bytes]  # of the pipes
-
-
 class SnifferMode:
     """A dongle in this mode. Times (`now`) are ns; a packet takes `half_ns` on USB, one way."""
 
-    def __init__(self, radio: int, air: RadioAir, agenda: Agenda, half_ns: int, seed: int) -> None:
-        self._radio, self._air, self._agenda, self._half_ns = radio, air, agenda, half_ns
+    def __init__(self, radio: int, air: RadioAir, half_ns: int, seed: int) -> None:
+        self._radio, self._air, self._agenda, self._half_ns = radio, air, air.agenda, half_ns
         self._random = random.Random(f"{seed} {radio}")
         self._rate = 1.0 + self._random.uniform(-_MOST_DRIFT, _MOST_DRIFT)
-        self.arrived: Callable[[bytes, bytes, Tuned, OnAir], None] = lambda *_: None  # address, packet
         self.give: Callable[[bytes], None] | None = None  # to the host
-        self.tuned: Tuned | None = None  # None: another mode
+        self.tuning: Tuning | None = None  # None: another mode
         self._wake = 0  # number of the wake-up that counts
         self.stop()
 
     def stop(self) -> None:
         """Another mode, or unplugged."""
-        self.tuned = self.give = None
+        self.tuning = self.give = None
         self.dropped = 0
         self._began_ns = self._deaf_ns = 0
         self._orders: deque[bytes] = deque()
@@ -62,10 +52,10 @@ class SnifferMode:
         self._wake += 1
         self._wanted = False  # the host reads
 
-    def start(self, now: int, tuned: Tuned) -> None:
+    def start(self, now: int, tuning: Tuning) -> None:
         """Begin to listen."""
         self.stop()
-        self._began_ns, self.tuned = now, tuned
+        self._began_ns, self.tuning = now, tuning
 
     # -- sending ----------------------------------------------------------------------------------------------------
     def order(self, transfer: bytes, now: int) -> None:
@@ -83,29 +73,30 @@ class SnifferMode:
 
     def _poll(self, now: int) -> None:
         """The thread looks whether there is something to send."""
-        if not self._orders or self.tuned is None:
+        tuning = self.tuning
+        if not self._orders or tuning is None:
             return
         transfer = self._orders.popleft()
         address, packet = transfer[:ADDRESS], transfer[ADDRESS:][:MAX_SNIFFED]
-        tuned = self.tuned
         turn = _OFF_NS + round(self._random.uniform(0, _TICK_NS)) + TURN_NS
-        frame = self._air.send(tuned.channel, tuned.rate, self._radio, now, len(packet), turn)
+        frame = self._air.send(tuning.channel, tuning.rate, self._radio, now, len(packet), turn)
         self._deaf_ns = frame.end_ns + _ON_NS
-        self._agenda.at(frame.end_ns, lambda: self.arrived(address, packet, tuned, frame))
+        self._agenda.at(frame.end_ns, lambda: self._air.broadcast(address, packet, tuning, frame))
         if self._orders:
             self._schedule_poll(self._deaf_ns + round(self._random.uniform(0, _POLL_NS)))
 
     # -- hearing ----------------------------------------------------------------------------------------------------
-    def receive(self, address: bytes, packet: bytes, frame: OnAir) -> None:
+    def receive(self, address: bytes, packet: bytes, tuning: Tuning, frame: OnAir) -> None:
         """A packet has left the air, and nothing has disturbed it here."""
-        if self.tuned is None or address not in self.tuned.addresses or frame.air_ns < self._deaf_ns:
+        own = self.tuning
+        if own is None or own[:2] != tuning[:2] or address not in own.addresses or frame.air_ns < self._deaf_ns:
             return
         now = frame.end_ns
         if len(self._received) == QUEUE:
             self.dropped = (self.dropped + 1) & 0xFFFFFFFF
         else:
             stamp = round((now - self._began_ns) * self._rate) // 1000 & 0xFFFFFFFF
-            head = _HEAD.pack(_HEAD.size + len(packet), _RSSI, self.tuned.addresses.index(address), stamp)
+            head = _HEAD.pack(_HEAD.size + len(packet), _RSSI, own.addresses.index(address), stamp)
             self._received.append(head + packet)
             self._agenda.at(now + self._half_ns, self._deliver)
         if self._orders:
