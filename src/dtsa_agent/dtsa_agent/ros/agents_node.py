@@ -6,6 +6,7 @@ import json
 import os
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -207,7 +208,7 @@ class AgentsNode(ABC):
 
     def _all_counts(self) -> dict[str, int]:
         """Return the number of messages and frames not received so far, by reason."""
-        return dict(self.intake.counts) | {name: count for name, count in self._dropped_frames().items() if count}
+        return self.intake.counts + Counter(self._dropped_frames())  # without those that are 0
 
     # Odometry.
 

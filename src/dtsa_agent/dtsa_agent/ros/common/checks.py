@@ -9,7 +9,7 @@ import json
 import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -76,12 +76,6 @@ class Intake:
             yield
         except BadMessage as error:
             self.drop(error.reason, str(error))
-
-
-def add_counts(total: dict[str, int], more: Mapping[str, int]) -> None:
-    """Add counts by reason to a total."""
-    for reason, count in more.items():
-        total[reason] = total.get(reason, 0) + count
 
 
 class PublisherGuard:
