@@ -36,10 +36,7 @@ def user_script(name: str, agents: int) -> str:
 
 
 def foxglove(agents: int = AGENTS) -> str:
-    """The layout for Foxglove and Lichtblick.
-
-    :param agents: number of agents.
-    """
+    """The layout for Foxglove and Lichtblick, for a number of agents."""
     layout = json.loads(FOXGLOVE.read_text(encoding="utf-8"))
     scene, heights = layout["configById"]["3D!swarm"], layout["configById"]["Plot!heights"]
     scene["cameraState"]["distance"] = max(9, round(0.45 * agents, 1))  # the whole swarm is in it
@@ -56,10 +53,7 @@ def foxglove(agents: int = AGENTS) -> str:
 
 
 def plotjuggler(agents: int = AGENTS) -> str:
-    """The layout for PlotJuggler.
-
-    :param agents: number of agents.
-    """
+    """The layout for PlotJuggler, for a number of agents."""
     root = ElementTree.fromstring(PLOTJUGGLER.read_text(encoding="utf-8"))
     for parent in (*root.iter("plot"), *root.iter("customMathEquations")):
         fit(parent, agents)

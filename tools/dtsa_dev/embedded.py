@@ -129,10 +129,7 @@ def _measure_board(directory: Path) -> tuple[list[str], list[list[str]], str]:
 
 
 def fly_here(directory: Path, slots: int = 200, soft: bool = False) -> list[EmbeddedFlight]:
-    """The flights of ``flight.c`` on this machine.
-
-    :param soft: by the code for processors whose doubles are software.
-    """
+    """The flights of ``flight.c`` on this machine; `soft`: by the code for processors whose doubles are software."""
     flags = ["-O2", f"-I{HERE}", f"-DSLOTS={slots}", *(["-DDTSA_SOFT_DOUBLES"] if soft else [])]
     program = compile_program(tool("gcc", "gcc"), directory / "flight", [HERE / "flight.c", *sources()], flags)
     return _read_flights(_run([str(program)]))
@@ -141,10 +138,8 @@ def fly_here(directory: Path, slots: int = 200, soft: bool = False) -> list[Embe
 def fly_on_cortex(
     directory: Path, slots: int = 200, metered: bool = True, more: Sequence[str] = ()
 ) -> list[EmbeddedFlight]:
-    """The same flights on a Cortex-M4F in QEMU.
+    """The same flights on a Cortex-M4F in QEMU; `metered` counts stack and instructions of each call, slowly.
 
-    :param metered: count stack and instructions of each call, which takes a while.
-    :param more: flags of the compiler.
     :raises NotHere: where compiler or QEMU are missing.
     """
     flags = [*CORTEX, "-O2", f"-I{HERE}", f"-DSLOTS={slots}", *(["-DMETERED"] if metered else []), *more]
@@ -154,8 +149,7 @@ def fly_on_cortex(
 def fly_app_on_cortex(directory: Path, slots: int = 200, sample: bool = False) -> list[BoardCosts]:
     """The app's loop there, with 12 agents and with as many as it is made for.
 
-    :param slots: of each flight, from when the app steers.
-    :param sample: the greatest swarm with ``lease`` alone.
+    A `sample` is that swarm with ``lease`` alone. Of each flight `slots` count, from when the app steers.
     """
     files = [HERE / "board_cost.c", *(path for path in _app_sources() if path.name != "app.c")]
     flags = [*CORTEX, "-Os", f"-DSLOTS={slots}", *(["-DSAMPLE"] if sample else []), *_app_folders()]

@@ -188,7 +188,7 @@ loss, and checks the protocol's invariants in each; then breaks one rule at a ti
 def build(directory: Path, mutant: Mutant | None = None, relay_reach: int = 24) -> Path:
     """Compile the explorer, in a directory with a copy of the library. Parts that no mutant changes are compiled once.
 
-    :param relay_reach: slots that a relay speaks of, 1 to 24.
+    A relay speaks of `relay_reach` slots, 1 to 24.
     """
     compiler, library = tool("gcc", "gcc"), directory / f"libdtsa-{relay_reach}"
     parts, lease = library / "parts", library / "policy" / "lease"

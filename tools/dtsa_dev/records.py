@@ -19,11 +19,7 @@ EVIDENCE = _ROOT / "docs" / "evidence"
 def write_record(
     path: Path, command: str, heads: Sequence[str], rows: Sequence[Sequence[object]], figures: Mapping[str, Any]
 ) -> None:
-    """Write the record of a measurement, a row of its table a line.
-
-    :param command: that makes it again, without `tools/dtsa`.
-    :param figures: what else is to be known of it.
-    """
+    """Write the record of a measurement, a row of its table a line; `command`, without `tools/dtsa`, makes it again."""
     import numpy as np
 
     record = {

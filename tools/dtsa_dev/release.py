@@ -82,12 +82,7 @@ def python(version: str) -> str:
 
 
 class Release:
-    """Make and try the files of a release.
-
-    :param out: folder for the files.
-    :param work: folder for all else.
-    :param log: what all programs print.
-    """
+    """Make and try the files of a release, in `out`; all else goes to `work`, what programs print to `log`."""
 
     def __init__(self, out: Path, work: Path, log: IO[str]) -> None:
         self._out, self._work, self._log = out, work, log

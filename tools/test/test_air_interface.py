@@ -38,8 +38,10 @@ def test_agents_fly_on_when_their_interfaces_change(tmp_path: Path) -> None:
         found = Merge(flight.bags()).summary()
     assert is_verified(found), found["decisions_again"]
     for agent in (1, 2, 3, 4):  # all hear the others again
-        last = read(tmp_path / f"cf{agent}-1").slots[-30:]
-        assert {frame.sender for record in last for frame in record.heard} >= {1, 2, 3, 4} - {agent}
+        log = read(tmp_path / f"cf{agent}-1").log
+        assert log.heard is not None
+        last = log.heard.part(len(log) - 30, len(log))
+        assert set(last.sender[~last.before].tolist()) >= {1, 2, 3, 4} - {agent}
     summaries = [json.loads((tmp_path / f"cf{agent}-1" / "summary.json").read_text()) for agent in (1, 2, 3, 4)]
     assert [one["interface_changes"] for one in summaries] == [0, 1, 1, 0]
     assert summaries[3]["unsent_because"]["Network is unreachable"] > 0

@@ -66,7 +66,7 @@ MAY_BE_SMALL = {
     "event_tdma.py", "sense.py", "threshold_aoii.py",  # a scheme a file
     "interfaces.py",  # the types of Crazyswarm2, where they are installed
     "palette.py", "card.py",  # colours that layouts share; what notebooks show
-    "errors.py", "page_commands.py", "processes.py", "program.py",  # each has users in several rooms
+    "errors.py", "processes.py", "program.py",  # each has users in several rooms
 }  # fmt: skip
 MOST_FILES = 12  # of a package
 

@@ -57,6 +57,7 @@ class Stop:
         self._patience_s = patience_s
         self.signal = 0  # the first one; 0: none yet
         self.count = 0  # how many have come
+        self.interrupts = 0  # how many of them were Ctrl-C
         self._raises = False
         self._old: dict[int, Any] = {}
 
@@ -98,6 +99,7 @@ class Stop:
             _end_after(self._patience_s)
         self.signal = self.signal or number
         self.count += 1
+        self.interrupts += number == signal.SIGINT
         if self._raises:
             self._raises = False
             raise KeyboardInterrupt

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,7 @@ def _show_in_notebooks() -> None:
     shell = ipython.get_ipython() if ipython is not None else None
     if shell is not None:
         formatter = shell.display_formatter.formatters["image/png"]
-        if Figure not in formatter.type_printers:  # somebody else did, perhaps with settings
+        if Figure not in formatter.type_printers:  # another one did, perhaps with settings
             formatter.for_type(Figure, _png)
 
 
@@ -85,15 +85,10 @@ def plot_distances(*flights: FlightLog, titles: Sequence[str] | None = None, ax:
     :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: without a flight, or for a number of titles that does not fit.
     """
-    names = _titles(flights, titles)
-    with style():
-        figure, (axis,) = panels(1, width=5.6, height=3.6, given=_listed(ax))
-        for flight, name, shade in zip(flights, names, colours(list(range(len(flights)))), strict=True):
-            axis.plot(flight.distances["time_s"], flight.distances["distance_m"], color=shade, label=name)
-        axis.axhline(flights[0].config.limits.collision_m, color=QUIET, linewidth=1, linestyle=":")
-        axis.set(title="smallest distance [m]", xlabel="time [s]", ylim=(0, None))
-        if len(flights) > 1:
-            axis.legend()
+    figure, axis = _plot_over_time(
+        flights, titles, ax, "smallest distance [m]", lambda flight: flight.distances.set_index("time_s")["distance_m"]
+    )
+    axis.axhline(flights[0].config.limits.collision_m, color=QUIET, linewidth=1, linestyle=":")
     return figure
 
 
@@ -105,16 +100,29 @@ def plot_ages(*flights: FlightLog, titles: Sequence[str] | None = None, ax: Pane
     :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: without a flight, for a number of titles that does not fit, or if pandas is missing.
     """
+    return _plot_over_time(
+        flights, titles, ax, "mean age [slots]", lambda flight: flight.ages.groupby("time_s")["age_slots"].mean()
+    )[0]
+
+
+def _plot_over_time(
+    flights: Sequence[FlightLog],
+    titles: Sequence[str] | None,
+    ax: Panels,
+    title: str,
+    series: Callable[[FlightLog], Any],
+) -> tuple[Figure, Axes]:
+    """A line a flight: its series by time, s."""
     names = _titles(flights, titles)
     with style():
         figure, (axis,) = panels(1, width=5.6, height=3.6, given=_listed(ax))
         for flight, name, shade in zip(flights, names, colours(list(range(len(flights)))), strict=True):
-            mean = flight.ages.groupby("time_s")["age_slots"].mean()
-            axis.plot(mean.index, mean.to_numpy(), color=shade, label=name)
-        axis.set(title="mean age [slots]", xlabel="time [s]", ylim=(0, None))
+            values = series(flight)
+            axis.plot(values.index, values.to_numpy(), color=shade, label=name)
+        axis.set(title=title, xlabel="time [s]", ylim=(0, None))
         if len(flights) > 1:
             axis.legend()
-    return figure
+    return figure, axis
 
 
 def plot_bars(

@@ -53,5 +53,12 @@ def parallel_env(
 
 
 def channel(env: Any, messages: MessageMap | None = None, **more: Any) -> MessageEnv:
-    """Put a radio channel between the agents of any `ParallelEnv`; arguments and errors: :class:`MessageEnv`."""
+    """Put a radio channel between the agents of any `ParallelEnv`.
+
+    :param env: the environment; its agents in the order of `possible_agents` have the ids 1 to N.
+    :param messages: which numbers of an agent's observation, of shape (F,), belong to which other agent: a slice or
+        indices as `messages[agent][other]`, or a function of both names; None: agents choose what they send (`space`).
+    :param more: `space`, `step_ms`, `size`, `positions` and settings of the channel, as for :class:`MessageEnv`.
+    :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
+    """
     return MessageEnv(env, messages, **more)

@@ -6,13 +6,17 @@ import atexit
 import os
 import struct
 import time
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -21,7 +25,7 @@ from dtsa_bench.flights.domain import ros_domain
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.cdr import MarkerPacker, OdometryPacker
 from dtsa_bench.log.bag.errors import BagError
-from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.record import FORMAT, FORMAT_KEY, SLOT_RECORD, TYPE, frame_fields, pack_record
 from dtsa_bench.runs.config import RunConfig
@@ -235,3 +239,45 @@ def clock_ns(data: str) -> int:
 def as_it_arrives(data: bytes) -> str:
     """A recorded message, hexadecimal: the middleware fills the last word up with zeros."""
     return (data + bytes(-len(data) % 4)).hex()
+
+
+def rewrite(
+    source: Path,
+    target: Path,
+    edit: Callable[[list[BagMessage]], list[BagMessage]] = list,
+    more: Callable[[Writer], None] = lambda _: None,
+    records: bool = True,
+    without: str | None = None,
+    encodings: Mapping[str, str] = MappingProxyType({}),
+    **options: Any,
+) -> Path:
+    """Write a bag's file again with other messages and options of another writer: what a careful forger would write.
+
+    :param more: adds what stands before the messages.
+    :param records: of metadata are kept, which `mcap filter` does not do.
+    :param without: a word; lines of metadata with it are left out.
+    :param encodings: of messages, by topic.
+    """
+    target.parent.mkdir(exist_ok=True)
+    with Bag(source) as bag:
+        path, messages = bag.path, edit(list(bag.messages()))
+    with path.open("rb") as old, target.open("wb") as new:
+        reader, writer = make_reader(old), Writer(new, **({"chunk_size": 20_000} | options))
+        writer.start(profile="ros2")
+        for record in reader.iter_metadata() if records else ():
+            texts = {key: text.splitlines() for key, text in record.metadata.items()}
+            kept = {key: [line for line in lines if not without or without not in line] for key, lines in texts.items()}
+            writer.add_metadata(record.name, {key: "\n".join(lines) for key, lines in kept.items()})
+        channels, summary = {}, reader.get_summary()
+        for channel in summary.channels.values():
+            schema, encoding = (
+                summary.schemas[channel.schema_id],
+                encodings.get(channel.topic, channel.message_encoding),
+            )
+            number = writer.register_schema(schema.name, schema.encoding, schema.data)
+            channels[channel.topic] = writer.register_channel(channel.topic, encoding, number, channel.metadata)
+        more(writer)
+        for m in messages:
+            writer.add_message(channels[m.topic], m.log_time_ns, m.data, m.publish_time_ns, m.sequence)
+        writer.finish()
+    return target

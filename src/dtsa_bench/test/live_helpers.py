@@ -16,7 +16,7 @@ import selectors
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -51,21 +51,20 @@ class LiveLaboratory(Laboratory):
     """A laboratory with dongles on its air."""
 
     def __init__(
-        self, path: Path, dongles: int, app: App, settings: LabSettings, out: Path | None = None, *observers: Observer
-    ) -> None:
+        self, path: Path, dongles: int, app: App, settings: LabSettings, out: Path | None = None,
+        observers: Sequence[Observer] = (),
+    ) -> None:  # fmt: skip
         stations = tuple(station(settings, agent) for agent in range(1, settings.agents + 1))
         radio = RadioSettings(dongles=dongles, path=path, stations=stations, loss=settings.loss, seed=settings.seed)
         self.server = RadioServer(radio, self._hear_ground, lambda index, up: self.is_on(index + 1))
         self._ticks = 0
         self._stopped = False
-        super().__init__(app, settings, out, [*observers, self._answer_ground])
+        more = [*observers, self._answer_ground]
+        super().__init__(app, settings, out, more, self.server.air, self.server.first)
         for agent, receiver in enumerate(self.server.receivers, 1):
             receiver.on_packet = partial(self.receive_poll, agent)
         self.air.peer_packet = self._between
         self.agenda.at(TICK_NS, self._log)
-
-    def _open_air(self, seed: int) -> None:
-        self.air, self._first = self.server.air, self.server.first
 
     def stop(self) -> None:
         """End :meth:`fly`; also from a signal's handler."""
@@ -124,23 +123,14 @@ class LiveLaboratory(Laboratory):
                 receiver.push(packet)
 
 
-class LiveOnboardSwarm(OnboardSwarm):
-    """The protocol on board, with dongles on its air; the ground is a program there."""
-
-    def __init__(self, path: Path, dongles: int, swarm: SwarmConfig, out: Path) -> None:
-        self._path, self._dongles = path, dongles
-        super().__init__(swarm, LabSettings(boot_s=0.1), out, key_of(swarm), enable_s=None)
-
-    def _make_laboratory(self, app: App, settings: LabSettings, out: Path | None) -> Laboratory:
-        return LiveLaboratory(self._path, self._dongles, app, settings, out, self.observe)
-
-
 def main() -> int:
     place, out, what, *more = sys.argv[1:]
     lab: Any
     if what.endswith(".json"):
         swarm = SwarmConfig.from_dict(json.loads(Path(what).read_text(encoding="utf-8")))
-        flight = LiveOnboardSwarm(Path(place), 3, swarm, Path(out))
+        # The protocol on board, with dongles on its air; the ground is a program there.
+        make = partial(LiveLaboratory, Path(place), 3)
+        flight = OnboardSwarm(swarm, LabSettings(boot_s=0.1), Path(out), key_of(swarm), enable_s=None, make=make)
         lab, finish = flight.lab, flight.summary
     else:
         lab = LiveLaboratory(Path(place), 3, read_app(what), LabSettings(agents=int(more[0])))

@@ -191,11 +191,10 @@ def slots() -> Iterator[Measurement]:
 
 
 def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0.2) -> float:
-    """Mean time of a whole slot over a flight with all agents moving, us.
+    """Mean time of a whole slot over a flight with all agents moving, us; the policy lets all agents share a table.
 
-    :param policy: a policy that lets all agents share a table.
-    :param most_slots: slots after which the flight is cut off.
-    :param least_s: short flights are repeated for so long; the fastest counts, others were disturbed.
+    A flight is cut off after `most_slots`. Short ones are repeated for `least_s`: the fastest counts, others were
+    disturbed.
     """
     config = SwarmConfig(agents=agents, moving=agents - agents % 2, policy=policy)
     swarm = Swarm(config, shared_table=True)

@@ -77,7 +77,7 @@ class PlayedSlot:
 def play(config: SwarmConfig, count: int, lost: tuple[int, int] = (-1, 0)) -> tuple[list[PlayedSlot], list[bool]]:
     """Play a swarm from slot 0 on: the slots, and which agents move.
 
-    :param lost: slot, and id of the agent that does not receive its frame.
+    `lost` is a slot, and the id of the agent that does not receive its frame.
     """
     swarm = Swarm(config)
     played = []

@@ -58,7 +58,7 @@ def _table_of(name: str) -> str:
 def settings_table(cls: type[Settings], groups: Iterable[str] = (), skip: Sequence[str] = ()) -> str:
     """The settings of a class, a row each; those that may change in flight are marked with a star.
 
-    :param groups: only settings with these headings; empty: all.
+    `groups` limits them to these headings.
     """
     wanted = set(groups)
     rows = [

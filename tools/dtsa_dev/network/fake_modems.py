@@ -71,9 +71,8 @@ class _FakeModem:
 class FakeModems:
     """Modems that hear each other, in a thread of their own.
 
-    :param settings: what they are.
-    :param channel: losses, groups that do not hear each other; its number of agents counts.
-    :param directory: where ``modem1``, ``modem2``, ... lead to their devices.
+    `channel` has losses, and groups that do not hear each other; in `directory` ``modem1``, ``modem2``, ... lead to
+    the devices.
     """
 
     def __init__(self, settings: FakeModemSettings, channel: ChannelConfig, directory: Path) -> None:

@@ -71,9 +71,7 @@ class CheckedFlight:
 def random_setting(seed: int, policy: str | None = None, *, lasts: bool | None = None) -> CheckedFlight:
     """A flight with a random policy, estimator, avoider, scenario, channel and random misfortune.
 
-    :param policy: instead of a random one.
-    :param lasts: with policy ``lease``: so long, with so few agents, that the dead are adopted and some come back;
-        default: now and then.
+    One that `lasts` has policy ``lease`` and few agents, so that the dead are adopted and some come back.
     """
     random = np.random.default_rng([seed, 13])
     pick = random.choice

@@ -48,8 +48,7 @@ def compile_program(
 ) -> Path:
     """Compile and link files, those of libdtsa among them, with its headers in reach; the program.
 
-    :param flags: besides those that keep the bits the same.
-    :param links: options of the linker, at the end.
+    `flags` come besides those that keep the bits the same, `links` at the end.
     """
     include = [f"-I{library / 'include'}", f"-I{library}"]
     command = [compiler, *SAME_BITS, *flags, *include, *map(str, files), "-o", str(out), *links]

@@ -14,6 +14,7 @@ from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import Vector
 from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.registry import REASONS
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import Scenario
 from dtsa_agent.core.station import check_slotted
@@ -136,7 +137,8 @@ class Agent:
     def decision(self) -> Decision:
         """Return the decision for the present slot."""
         swarm, slot = self.swarm, max(0, self.group.slot)
-        return Decision(slot, int(swarm.chosen[0]), swarm.reason_name(0), float(swarm.score[0]), int(swarm.digest[0]))
+        reason = REASONS[int(swarm.reason[0])]
+        return Decision(slot, int(swarm.chosen[0]), reason, float(swarm.score[0]), int(swarm.digest[0]))
 
     def command(self, position: Vector, velocity: Vector, slot: int, step: int = 0) -> Vector:
         """Return the commanded velocity for a control instant, 0 .. steps, of the present slot; m/s, frame map.

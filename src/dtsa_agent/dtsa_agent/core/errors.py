@@ -52,12 +52,8 @@ class ConfigError(DtsaError, ValueError):
 def range_text(low: float | None, high: float | None, unit: str = "") -> str:
     """Return a range in words, for ``allowed`` of an error; one of the bounds may be None."""
     first, last = (f"{bound:g}" if isinstance(bound, float) else str(bound) for bound in (low, high))
-    unit_text = f" {unit}" if unit not in ("", "1") else ""
-    if high is None:
-        return f"{first} or more{unit_text}"
-    if low is None:
-        return f"{last} or less{unit_text}"
-    return f"{first} to {last}{unit_text}"
+    text = f"{first} or more" if high is None else f"{last} or less" if low is None else f"{first} to {last}"
+    return text if unit in ("", "1") else f"{text} {unit}"
 
 
 class LocalProtocolError(DtsaError):
@@ -72,15 +68,6 @@ class PluginError(DtsaError):
 
     def __init__(self, part: str, fault: str) -> None:
         super().__init__(f"{part}: {fault}")
-
-    @classmethod
-    def from_exception(cls, part: str, error: BaseException) -> PluginError:
-        """Wrap an exception that a plug-in raised; names file and line."""
-        trace = error.__traceback__
-        while trace is not None and trace.tb_next is not None:
-            trace = trace.tb_next
-        place = f" ({trace.tb_frame.f_code.co_filename}:{trace.tb_lineno})" if trace else ""
-        return cls(part, f"{type(error).__name__}: {error}{place}")
 
     def __reduce__(self) -> tuple[type[PluginError], tuple[str, str]]:
         part, _, fault = str(self).partition(": ")

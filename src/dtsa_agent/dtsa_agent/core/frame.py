@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,12 +21,10 @@ FRAME_MAX: int = lib.DTSA_FRAME_MAX  # bytes
 TAG_LENGTH: int = lib.DTSA_TAG_BYTES  # bytes of authentication after a frame, and after what plug-ins append to it
 MAX_EXTENDED_AGENTS: int = lib.DTSA_EXTENDED_AGENTS_MAX  # ids have 8 bits in extended frames
 OPEN: int = lib.LEASE_OPEN  # lessee of a turn that is open to all who wake
-_HEADER_LENGTH = 8  # bytes up to the end of the slot
 
 POSITION_STEP = 0.002  # m, one step of a coordinate at the default extent
 EXTENT_M = 65.534  # m, default extent: 32767 steps, the largest coordinate that a frame can say
 
-_ZERO: Vector = (0.0, 0.0, 0.0)
 _NEAR = range(1, lib.RELAY_REACH + 1)  # slots ahead that a relay speaks of
 _FAR = range(lib.RELAY_REACH + 1, lib.FAR_REACH + 1)  # ... and that are handed on to one agent
 _FAULTS = {
@@ -91,7 +90,7 @@ def encode_frame(frame: Frame, extent_m: float = EXTENT_M) -> bytes:
     :raises LocalProtocolError: if a field is not a number or an id is out of range.
     """
     profile = PROFILE_PAPER if frame.intent is None else PROFILE_PAPER_INTENT
-    return _encode(frame, lambda: ffi.new("dtsa_frame *", _own(frame, profile)), lib.frame_encode, extent_m)
+    return _encode(frame, "dtsa_frame *", lambda: _own(frame, profile), lib.frame_encode, extent_m)
 
 
 def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:
@@ -99,13 +98,13 @@ def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:
 
     :raises LocalProtocolError: if a field is out of range, or the sections do not fit.
     """
-    return _encode(frame, lambda: _record(frame), lib.extended_encode, extent_m)
+    return _encode(frame, "extended_frame *", lambda: _sections(frame), lib.extended_encode, extent_m)
 
 
-def _encode(frame: object, make: Any, encode: Any, extent_m: float) -> bytes:
+def _encode(frame: object, structure: str, fields: Callable[[], dict[str, Any]], encode: Any, extent_m: float) -> bytes:
     out = ffi.new("uint8_t[]", FRAME_MAX)
     try:
-        length = encode(make(), position_step(extent_m), out)
+        length = encode(ffi.new(structure, fields()), position_step(extent_m), out)
     except (OverflowError, IndexError, TypeError, ValueError) as error:
         raise LocalProtocolError(f"not encodable: {frame} ({error})") from error
     if not length:
@@ -116,22 +115,20 @@ def _encode(frame: object, make: Any, encode: Any, extent_m: float) -> bytes:
 def _own(frame: Frame, profile: int) -> dict[str, Any]:
     return {
         "profile": profile, "sender": frame.sender, "slot": frame.slot & 0xFFFFFFFF, "c_r": frame.c_r,
-        "p": frame.position, "v": frame.velocity, "c": frame.intent or _ZERO,
+        "p": frame.position, "v": frame.velocity, "c": frame.intent or (0.0, 0.0, 0.0),
     }  # fmt: skip
 
 
-def _record(frame: ExtendedFrame) -> Any:
-    far = _mask_of(frame.far, _FAR)
-    return ffi.new("extended_frame *", {
+def _sections(frame: ExtendedFrame) -> dict[str, Any]:
+    far = _mask_of(frame.far, _FAR).to_bytes(lib.FAR_BYTES, "little")
+    gossip = [{"id": g.agent, "age": g.age, "c_r": g.moving, "p": g.position, "v": g.velocity} for g in frame.gossip]
+    return {
         "own": _own(frame.own, PROFILE_EXTENDED), "c_s": frame.c_s, "leaving": frame.leaving,
-        "probation": frame.probation, "gossip_count": len(frame.gossip), "lease_count": len(frame.leases),
-        "gossip": [
-            {"id": g.agent, "age": g.age, "c_r": g.moving, "p": g.position, "v": g.velocity} for g in frame.gossip
-        ],
-        "leases": frame.leases, "relay_mask": _mask_of(tuple(ahead for ahead, _ in frame.relay), _NEAR),
-        "relay_ids": bytes(lessee for _, lessee in frame.relay),
-        "far_id": frame.far_lessee, "far_mask": far.to_bytes(lib.FAR_BYTES, "little"),
-    })  # fmt: skip
+        "probation": frame.probation, "gossip_count": len(gossip), "gossip": gossip,
+        "lease_count": len(frame.leases), "leases": frame.leases,
+        "relay_mask": _mask_of(tuple(ahead for ahead, _ in frame.relay), _NEAR),
+        "relay_ids": bytes(lessee for _, lessee in frame.relay), "far_id": frame.far_lessee, "far_mask": far,
+    }  # fmt: skip
 
 
 def _mask_of(ahead: tuple[int, ...], reach: range) -> int:
@@ -189,7 +186,7 @@ def _vector(numbers: Any) -> Vector:
 
 def named_in(data: bytes) -> tuple[int, int] | None:
     """The sender's id and the slot (32 bits) that a frame names, whatever follows it in the bytes; None: it is none."""
-    if len(data) < _HEADER_LENGTH or data[0] >> 4 != lib.FRAME_VERSION or data[0] & 15 not in LENGTHS:
+    if len(data) < 8 or data[0] >> 4 != lib.FRAME_VERSION or data[0] & 15 not in LENGTHS:
         return None
     sender = data[1] if data[0] & 15 == PROFILE_EXTENDED else int.from_bytes(data[1:3], "little")
     return sender, int.from_bytes(data[4:8], "little")

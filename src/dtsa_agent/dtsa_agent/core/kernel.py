@@ -6,14 +6,14 @@ A structure, a number or a name stands once, in C. Arrays stay NumPy's: C borrow
 from __future__ import annotations
 
 from itertools import count, takewhile
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ._kernel import ffi, lib
 
-__all__ = ["NAMES", "ffi", "fields_of", "lib", "memory"]
+__all__ = ["NAMES", "ffi", "fields_of", "lib", "memory", "shared_arrays"]
 
 
 def _strings(names: Any) -> tuple[str, tuple[str, ...]]:
@@ -42,3 +42,10 @@ def fields_of(structure: str, source: object, **others: Any) -> dict[str, Any]:
     """Return the fields of a structure in C: those given, else the attributes of ``source`` with their names."""
     names = [name for name, _ in ffi.typeof(structure).fields]
     return {name: getattr(source, name) for name in names if name not in others and hasattr(source, name)} | others
+
+
+def shared_arrays(cls: type, structure: str) -> dict[str, tuple[str, str]]:
+    """Return the arrays that a class shares with C: letters of the shape, and type of the items, by name."""
+    kinds, hints = dict(ffi.typeof(structure).fields), get_type_hints(cls, include_extras=True)
+    shapes = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+    return {name: (shape, kinds[name].type.item.cname.removesuffix("_t")) for name, shape in shapes.items()}

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from .errors import ConfigError
 from .kernel import NAMES
@@ -47,12 +47,7 @@ REASON_TEXTS: Mapping[str, str] = MappingProxyType(
 )
 
 
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-Row = TypeVar("Row", bound=_Named)
+Row = TypeVar("Row", bound=Any)  # has a name
 
 
 @dataclass(frozen=True, slots=True)

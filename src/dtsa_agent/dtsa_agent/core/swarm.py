@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import IntEnum
 from functools import lru_cache
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from .authentication import Authenticator
 from .errors import ConfigError
 from .frame import FRAME_MAX, position_step
-from .kernel import ffi, fields_of, lib, memory
-from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
+from .kernel import ffi, fields_of, lib, memory, shared_arrays
+from .registry import ESTIMATORS, POLICIES, SELECTIONS
 from .settings.config import SwarmConfig
 from .settings.flight_models import flight_model
 from .settings.scenario import Course, Scenario, check_extent, make_scenario, policy_key
@@ -68,6 +68,7 @@ class Swarm:
     """
 
     all_in_c = True  # no step is overridden
+    flies_in_c = True  # nor are estimates and commands
 
     # What C borrows, by the names in ``swarm`` (libdtsa_sim/swarm.h). Letters of shapes: n agents, v tables, l local
     # agents, s control instants, f bytes of a frame, p bytes of a policy's state.
@@ -136,7 +137,6 @@ class Swarm:
         self._share_arrays(kernel, sizes)
         self.local[:], self.observer[:], self.final[:] = np.array(self.ids) - 1, np.array(tables) - 1, 1
         self.known_goal[:] = self.scenario.target
-        self.rows = np.arange(count)  # (L,) table of each local agent, unless shared
         self.course: Course | None = self.scenario.course(self.local)  # where they are in the scenario's plan
         self.kernel = ffi.gc(kernel, lib.swarm_close)
         fault = lib.swarm_open(self.kernel)
@@ -161,14 +161,14 @@ class Swarm:
 
     def _protocol(self, model: Any) -> dict[str, Any]:
         """Return the fields of ``dtsa_config``; what is not named here has the names of the settings."""
-        config, key = self.config, self.scenario.policy_key
+        config = self.config
         lease = fields_of("dtsa_lease_config", config, open_every=config.open_period, share=config.lease_share)
         return fields_of(
             "dtsa_config", config, policy=POLICIES.number(config.policy), estimator=ESTIMATORS.number(config.estimator),
             avoider=model.kind, selection=SELECTIONS.index(config.selection),
             profile=config.profile,
             targets_known=config.targets_known and self.scenario.goals_known,
-            position_step=position_step(config.extent_m), key=policy_key(config.seed) if key is None else key,
+            position_step=position_step(config.extent_m), key=policy_key(config.seed),
             avoid=model.avoider.to_dict(), lease=lease, start=memory(self._start),
             decay=memory(self._decay), decay_len=DECAY_STEPS,
         )  # fmt: skip
@@ -176,9 +176,8 @@ class Swarm:
     def _share_arrays(self, kernel: Any, sizes: dict[str, int]) -> None:
         """Make the arrays and lend them to C."""
         self._borrowed = []
-        for name, letters in _SHAPES.items():
-            shape = tuple(sizes[letter] if letter in sizes else int(letter) for letter in letters)
-            array = np.zeros(shape, _ITEMS[name])
+        for name, (letters, item) in _ARRAYS.items():
+            array = np.zeros(tuple(sizes[letter] if letter in sizes else int(letter) for letter in letters), item)
             self._borrowed.append(memory(array, writable=True))
             setattr(self, name, array)
             setattr(kernel, name, self._borrowed[-1])
@@ -196,6 +195,9 @@ class Swarm:
 
     def begin(self, slot: int) -> tuple[int, ...]:
         """Decide who sends in a slot, and encode the frames; returns the positions in ``ids`` of those that send."""
+        if not self.all_in_c:
+            self.decide(slot)
+            return self.emit(slot)
         self._slot = slot
         count = lib.swarm_begin(self.kernel, slot)
         return (self._senders[0],) if count == 1 else tuple(self._senders[:count])
@@ -233,7 +235,12 @@ class Swarm:
 
     def fly(self, slot: int) -> None:
         """Commands and motion of the local agents during a slot, :meth:`steer` and :meth:`move` at each instant."""
-        lib.swarm_fly(self.kernel, slot, 0)
+        if self.flies_in_c:
+            lib.swarm_fly(self.kernel, slot, 0)
+            return
+        for step in range(self.config.steps):
+            self.steer(slot, step)
+            self.move(step)
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         """Fill ``command`` for one control instant, 0 .. steps; ``estimate``: whether to fill the estimates first."""
@@ -316,7 +323,7 @@ class Swarm:
         swarm = Swarm(self.config, self.scenario, local=self.ids)
         swarm.sends[:] = self.sends
         swarm.emit(slot)  # lists the senders of the present slot; what this encodes is written over below
-        for name in _SHAPES.keys() - {"observer"}:
+        for name in _ARRAYS.keys() - {"observer"}:
             getattr(swarm, name)[...] = getattr(self, name)  # the one table becomes everybody's
         swarm.course, swarm.authenticator = self.course, self.authenticator
         return swarm
@@ -340,10 +347,6 @@ class Swarm:
             raise ValueError(f"local index: got {local_index}")
         return int(local_index)
 
-    def reason_name(self, local_index: int) -> str:
-        """Why the agent decided as it did in this slot, one of ``REASONS``."""
-        return REASONS[int(self.reason[local_index])]
-
     @property
     def rejected(self) -> int:
         """Frames heard that were not authentic: forged, changed, replayed or cut. 0 without a key."""
@@ -360,9 +363,4 @@ class Swarm:
         return int(self.rejects[1])
 
 
-_SHAPES = {
-    name: hint.__metadata__[0]
-    for name, hint in get_type_hints(Swarm, include_extras=True).items()
-    if hasattr(hint, "__metadata__")
-}
-_ITEMS = {name: kind.type.item.cname.removesuffix("_t") for name, kind in ffi.typeof("swarm").fields if name in _SHAPES}
+_ARRAYS = shared_arrays(Swarm, "swarm")

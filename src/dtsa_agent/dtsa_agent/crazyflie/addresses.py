@@ -1,12 +1,10 @@
 """Where Crazyflies are reached: addresses as cflib has them, which of them name one link, and what each radio carries.
 
-Everything over a Crazyradio is an exchange: a packet, and its acknowledgement, which may carry one back. An exchange
-takes the time of its bits on the air, the turns of both radios, and USB's turn-round; the dongle is told the address by
-a request of its own, about 1 ms more whenever the Crazyflie is another one than before. Twice as many exchanges as
-packets are wanted: an answer waits for the next exchange, and some are lost. Field experience is that 4 Crazyflies at
-50 Hz of commands and logs work on one radio and 8 at 20 Hz; that is what comes out at 2 Mbit/s.
-
-Dongles on one channel disturb each other, so a channel carries no more than one dongle.
+Everything over a Crazyradio is an exchange: a packet, and its acknowledgement, which may carry one back. It takes the
+time of its bits on the air, the turns of both radios, and USB's; where a dongle has several Crazyflies, also a request
+that tells it the address. Twice as many exchanges as packets are wanted: an answer waits for the next exchange, and
+some are lost. Field experience is that one radio carries 4 Crazyflies at 50 Hz of commands and logs, and 8 at 20 Hz;
+that is what comes out at 2 Mbit/s. Dongles on one channel disturb each other, so a channel carries no more than one.
 """
 
 from __future__ import annotations
@@ -15,13 +13,14 @@ import re
 import socket
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from typing import NamedTuple
+from urllib.parse import urlsplit
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
 BITRATES = {"250K": 250_000, "1M": 1_000_000, "2M": 2_000_000}
 ANY = "*"  # any dongle
-LAST_CHANNEL, LAST_PORT = 125, 65535
+LAST_CHANNEL = 125
 OVERHEAD_BITS = 73  # of a packet: preamble, address, control, checksum
 TURN_S = 130e-6  # until a radio sends
 USB_S = 0.2e-3  # there and back: a Crazyradio 2 is known to carry about 1370 exchanges a second with one Crazyflie
@@ -38,16 +37,14 @@ _RADIO = re.compile(
     r"radio://(?P<radio>\*|\d{1,9}|[0-9A-Fa-f]{10})"
     r"(?:/(?P<channel>\d{1,3})(?:/(?P<rate>250K|1M|2M)(?:/(?P<node>[0-9A-Fa-f]{1,10}))?)?)?/?(?:\?[\w=&.]*)?"
 )
-_NETWORK = re.compile(r"(?P<scheme>udp|tcp)://(?P<host>[\w.-]+):(?P<port>\d{1,6})/?")
-_WIRED = re.compile(r"(?P<scheme>usb|serial|prrt)://[\w./:-]+")
+_NETWORK, _WIRED = ("udp", "tcp"), ("usb", "serial", "prrt")
 
 
 class LinkError(DtsaError):
     """A connection could not be made; the text says why."""
 
 
-@dataclass(frozen=True, slots=True)
-class Address:
+class Address(NamedTuple):
     """One Crazyflie's address, with cflib's defaults written out."""
 
     uri: str
@@ -76,22 +73,20 @@ def parse_address(uri: str) -> Address:
         if channel > LAST_CHANNEL:
             raise ConfigError("uri", uri, f"a channel from 0 to {LAST_CHANNEL}")
         return Address(uri, "radio", match["radio"].upper(), channel, match["rate"] or "2M", node)
-    if match := _NETWORK.fullmatch(uri):
-        if not 1 <= int(match["port"]) <= LAST_PORT:
-            raise ConfigError("uri", uri, f"a port from 1 to {LAST_PORT}")
-        host = match["host"].lower()
-        return Address(uri, match["scheme"], host="127.0.0.1" if host == "localhost" else host, port=int(match["port"]))
-    if match := _WIRED.fullmatch(uri):
-        return Address(uri, match["scheme"])
+    parts = urlsplit(uri.rstrip("/"))
+    if parts.scheme in _NETWORK and parts.hostname and not parts.path:
+        with suppress(ValueError):  # larger than a port can be
+            if parts.port:
+                host = "127.0.0.1" if parts.hostname == "localhost" else parts.hostname
+                return Address(uri, parts.scheme, host=host, port=parts.port)
+        raise ConfigError("uri", uri, "a port from 1 to 65535")
+    if parts.scheme in _WIRED and (parts.netloc or parts.path):
+        return Address(uri, parts.scheme)
     raise ConfigError("uri", uri, _ALLOWED)
 
 
 def check_distinct(robots: Sequence[tuple[str, Address]]) -> None:
-    """Refuse one Crazyflie under two names; hosts that share a port are looked up.
-
-    :param robots: name and address of each.
-    :raises ConfigError: two addresses are of one link.
-    """
+    """Refuse one Crazyflie, or link, under two names (ConfigError); hosts that share a port are looked up."""
     ports = [(address.scheme, address.port) for _, address in robots]
     names: dict[str, str] = {}
     for name, address in robots:
@@ -105,25 +100,22 @@ def check_distinct(robots: Sequence[tuple[str, Address]]) -> None:
         names[link] = name
 
 
-# -- what radios carry ------------------------------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class RadioLoad:
+class RadioLoad(NamedTuple):
     """What one radio, or one channel of several radios, has to carry."""
 
     medium: str  # radio, or channel of several radios
-    count: int  # of Crazyflies
+    number: int  # of Crazyflies
     exchanges: float  # wanted, per second
     seconds: float  # that they take, per second
     fitting_hz: float  # Hz: rate of commands and logs with which it would fit
 
     @property
     def fits(self) -> bool:
-        """True when the radio can carry it."""
         return self.seconds <= 1.0
 
     def __str__(self) -> str:
         capacity = self.exchanges / self.seconds
-        load = f"{self.medium}: {self.count} Crazyflies, {self.exchanges:.0f} of {capacity:.0f} exchanges/s"
+        load = f"{self.medium}: {self.number} Crazyflies, {self.exchanges:.0f} of {capacity:.0f} exchanges/s"
         return f"{load}: fits" if self.fits else f"{load}: DOES NOT FIT ({self.advice})"
 
     @property
@@ -134,11 +126,7 @@ class RadioLoad:
 
 
 def exchange_s(rate: str, *, shared: bool) -> float:
-    """Return how long an exchange takes, s.
-
-    :param rate: a key of BITRATES.
-    :param shared: the radio has several Crazyflies.
-    """
+    """Return how long an exchange takes, s, at a rate of BITRATES; `shared`: the radio has several Crazyflies."""
     bits = 2 * OVERHEAD_BITS + 8 * (UP_BYTES + DOWN_BYTES)
     return (REQUEST_S if shared else 0.0) + USB_S + 2 * TURN_S + bits / BITRATES[rate]
 
@@ -174,9 +162,9 @@ def check_budget(loads: Iterable[RadioLoad], *, force: bool) -> None:
     """Refuse what cannot fit, unless that is forced; ConfigError: a radio or a channel has too much to carry."""
     for load in loads:
         if not load.fits and not force:
-            most, capacity = int(load.count / load.seconds), load.exchanges / load.seconds
+            most, capacity = int(load.number / load.seconds), load.exchanges / load.seconds
             raise ConfigError(
-                load.medium, f"{load.count} Crazyflies with {load.exchanges:.0f} exchanges/s",
+                load.medium, f"{load.number} Crazyflies with {load.exchanges:.0f} exchanges/s",
                 f"{capacity:.0f} exchanges/s, {most} Crazyflies at these rates: {load.advice}, use more radios "
                 "on channels of their own or a higher data rate, or set force_budget",
             )  # fmt: skip

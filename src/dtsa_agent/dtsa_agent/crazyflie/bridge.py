@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
@@ -23,38 +22,32 @@ from .link import SIMULATED_RADIO, require_cflib
 from .onboard import OnboardSetup, app_orders, app_parameters, key_of
 from .safety import Action, RequiredAction, SafetyMonitor
 from .settings import SwarmSettings
-from .state import OFF, WATCHED_OVER, State, VehicleState
+from .state import OFF, WATCHED, State, VehicleState
 from .vehicle import CrazyflieVehicle
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
 
 
-class Ownership:
-    """Locks on the addresses (name, URI) of Crazyflies, among the processes of a machine. They end with the process.
+def own_addresses(robots: Iterable[tuple[str, str]]) -> ExitStack:
+    """Lock the addresses (name, URI) of Crazyflies among the processes of a machine, until what it returns is closed.
 
     A Crazyflie belongs to one bridge at a time: two that send to it would both believe to be alone.
 
     :raises ConfigError: another bridge has one of them.
     """
-
-    def __init__(self, robots: Iterable[tuple[str, str]]) -> None:
-        self._files = ExitStack()
-        directory = Path(tempfile.gettempdir()) / f"dtsa-crazyflies-{os.getuid()}"
-        directory.mkdir(mode=0o700, exist_ok=True)
+    directory = Path(tempfile.gettempdir()) / f"dtsa-crazyflies-{os.getuid()}"
+    directory.mkdir(mode=0o700, exist_ok=True)
+    with ExitStack() as files:
         for name, uri in robots:
             air = os.environ.get(SIMULATED_RADIO, "") if uri.startswith("radio://") else ""  # one of several
             digest = hashlib.sha256((air + parse_address(uri).link).encode()).hexdigest()
-            file = self._files.enter_context((directory / digest).open("w"))
+            file = files.enter_context((directory / digest).open("w"))
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                self.release()
                 raise ConfigError(f"robots.{name}.uri", uri, "a Crazyflie that no other bridge here uses") from None
-
-    def release(self) -> None:
-        """Others may have them."""
-        self._files.close()
+        return files.pop_all()
 
 
 class Bridge:
@@ -65,18 +58,16 @@ class Bridge:
     """
 
     def __init__(
-        self,
-        settings: SwarmSettings,
-        log: Callable[[str, str], None],
+        self, settings: SwarmSettings, log: Callable[[str, str], None],
         on_state: Callable[[CrazyflieVehicle, VehicleState], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.settings = settings
         station = settings.station
         for line in settings.describe():
             log("info", line)
         check_budget(settings.loads, force=station.force_budget)
         require_cflib()
-        self._ownership = Ownership((robot.name, robot.uri) for robot in settings.robots)
+        self._owned = own_addresses((robot.name, robot.uri) for robot in settings.robots)
         self._log = log
         caches = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
         cache = Path(station.toc_cache or caches / "dtsa/crazyflie").expanduser()
@@ -93,22 +84,14 @@ class Bridge:
         self._guard = threading.Thread(target=self._run_rules, name="safety", daemon=True)
         self._guard.start()
 
-    # -- connection -------------------------------------------------------------------------------------------------
-    def connect(self, stop: Callable[[], bool] = lambda: False) -> list[str]:
-        """Connect all in parallel and wait; the names of those that are not connected.
-
-        :param stop: asked ten times a second; True ends the wait.
-        """
-        waiting = threading.Semaphore(0)
-        for vehicle in self.vehicles.values():
-            vehicle.connect(waiting.release)
-        for _ in self.vehicles:
-            while not (waiting.acquire(timeout=0.1) or stop()):
-                pass
+    def connect(self, stop: object = False) -> list[str]:
+        """Connect all in parallel and wait, until `stop` is true; the names of those that are not connected."""
+        for thread in [vehicle.connect() for vehicle in self.vehicles.values()]:
+            while thread.is_alive() and not stop:
+                thread.join(0.1)
         return [v.name for v in self.vehicles.values() if v.state in OFF]
 
     def _prepare_apps(self, swarm: SwarmConfig) -> None:
-        """What agents on board are told, where they steer."""
         scenario, station = make_scenario(swarm), self.settings.station
         values = app_parameters(swarm, scenario, station.room_origin_in_world[2])
         orders = app_orders(swarm, scenario, key_of(swarm))
@@ -133,16 +116,9 @@ class Bridge:
                 return f"{name} may still be in the air: {wait}"
             if state not in (State.LOST, State.DISCONNECTED, State.EMERGENCY):
                 return f"{name} is {state.name.lower()}"
-            vehicle.connect(partial(self._rejoin, name))
+            vehicle.connect(rejoin=True)
         return ""
 
-    def _rejoin(self, name: str) -> None:
-        """It is connected again, or not: its agent on board starts anew."""
-        link = self.vehicles[name].link
-        if link.connected and link.board is not None and (problem := link.start_agent()):
-            self._log("error", f"{name}: {problem}")
-
-    # -- orders to several ------------------------------------------------------------------------------------------
     def order_each(self, names: Iterable[str], order: Callable[[CrazyflieVehicle], str | None]) -> tuple[bool, str]:
         """Give an order to several; success and why not for those that refused.
 
@@ -160,23 +136,20 @@ class Bridge:
     def why_no_takeoff(self) -> str:
         """Why the swarm may not take off; empty if it may."""
         needed = self.settings.station.min_connected
-        usable = sum(v.state in (State.READY, *WATCHED_OVER) for v in self.vehicles.values())
+        usable = sum(v.state in (State.READY, *WATCHED) for v in self.vehicles.values())
         return f"{usable} Crazyflies are usable, min_connected is {needed}" if usable < needed else ""
 
     def land_all(self, reason: str) -> None:
-        """Land all that fly."""
         for vehicle in self.vehicles.values():
             if vehicle.state in (State.ARMED, State.FLYING):
                 vehicle.land(reason)
 
     def stop_all(self, reason: str) -> None:
-        """Emergency stop of all."""
         self._log("error", f"EMERGENCY STOP of all: {reason}")
         self.radios.stop_all()
         for vehicle in self.vehicles.values():
             vehicle.stop(reason)
 
-    # -- safety -----------------------------------------------------------------------------------------------------
     def _run_rules(self) -> None:
         keep_alive = 0.0
         while not self._closing.wait(TICK_S):
@@ -215,20 +188,16 @@ class Bridge:
         else:
             vehicle.stop(reason)
 
-    # -- the end ----------------------------------------------------------------------------------------------------
     def names_in_air(self, now: float) -> list[str]:
         """Names of those whose link must not be closed now."""
         return [
             v.name
             for v in self.vehicles.values()
-            if v.state in WATCHED_OVER or (v.state == State.LOST and v.log_age(now) < GROUNDED_S and v.link.connected)
+            if v.state in WATCHED or (v.state == State.LOST and v.log_age(now) < GROUNDED_S and v.link.connected)
         ]
 
     def wait_landed(self, stop: Callable[[], bool]) -> list[str]:
-        """Wait until all stand, or the station's time for that is over; the names of those that still fly.
-
-        :param stop: asked 50 times a second; True ends the wait at once.
-        """
+        """Wait until all stand, `stop` is true, or the station's time is over; the names of those that still fly."""
         end = time.monotonic() + self.settings.station.landing_timeout_s
         while True:
             now = time.monotonic()
@@ -255,4 +224,4 @@ class Bridge:
         with ThreadPoolExecutor(len(self.vehicles)) as pool:
             list(pool.map(lambda vehicle: vehicle.link.close(), self.vehicles.values()))
         self.radios.close()
-        self._ownership.release()
+        self._owned.close()

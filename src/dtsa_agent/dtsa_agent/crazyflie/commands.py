@@ -1,12 +1,8 @@
-"""A streamed command on its way from its topic to its vehicle: read, converted, checked.
+"""A streamed command on its way from its topic to its vehicle: read and converted.
 
 Everything is in the Crazyflies' world, with Crazyswarm2's units: `cmd_position` has its yaw in degrees,
 `cmd_velocity_world` its yaw rate in degrees per second, a full state counts in radians. A header with the frame `map`
-(the room's centre) is converted. The firmware wants the same, but for a full state: 16 bit numbers, so positions beyond
-32.767 m would overflow.
-
-rclpy's executor builds a wait set of everything that a node has for each message; with a hundred topics and services
-that takes longer than all the rest of a command's way. So these topics have a thread with a wait set of their own.
+(the room's centre) is converted.
 """
 
 from __future__ import annotations
@@ -15,10 +11,8 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from .safety import SafetySettings, outside_fence
 from .state import Vector, to_world
 
 VELOCITY_WORLD, POSITION, FULL_STATE = "velocity_world", "position", "full_state"
@@ -26,8 +20,7 @@ FULL_STATE_LIMIT = 32.767  # m, m/s, m/s^2, rad/s: 16 bit numbers in thousandths
 _POLL_NS = 100_000_000  # the end is noticed after this time at the latest
 
 
-@dataclass(frozen=True, slots=True)
-class Setpoint:
+class Setpoint(NamedTuple):
     """One streamed command, ready for the radio: a method of cflib's commander and its arguments."""
 
     kind: str  # velocity_world, position or full_state
@@ -76,42 +69,33 @@ def of_message(kind: str, m: Any, origin: Vector, stamp: float) -> Setpoint:
     return Setpoint(kind, arguments, stamp, place, math.hypot(*numbers[3:6]))
 
 
-def check_setpoint(setpoint: Setpoint, safety: SafetySettings, origin: Vector, fastest_mps: float) -> None:
-    """Refuse a streamed command that leads out of the room, or is too fast; ValueError: why it is refused."""
-    if setpoint.speed > fastest_mps:
-        limit = f"(station.max_stream_mps is {fastest_mps:g})"
-        raise ValueError(f"a command with {setpoint.speed:.2f} m/s is refused {limit}")
-    if setpoint.place is not None and (problem := outside_fence(setpoint.place, safety, origin)):
-        raise ValueError(f"a command to {problem} is refused")
-
-
 class TopicThread:
-    """Takes the newest messages of topics and calls back, in its own thread.
+    """Takes the newest messages of topics and calls back, in its own thread, with a node and a wait set of its own.
 
-    :param node: subscribes; must not be in an executor.
+    rclpy's executor builds a wait set of everything that a node has for each message; with a hundred topics and
+    services that takes longer than all the rest of a command's way.
     """
 
-    def __init__(self, node: Any, name: str) -> None:
-        self._node = node
+    def __init__(self, parent: Any, name: str) -> None:
+        from rclpy.node import Node
+
+        plain = {"enable_rosout": False, "start_parameter_services": False, "use_global_arguments": False}
+        space = parent.get_namespace()
+        self._node = Node(f"{parent.get_name()}_{name}", namespace=space, context=parent.context, **plain)
         self._subscriptions: list[tuple[Any, type, Callable[[Any, float], None]]] = []
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def subscribe(self, kind: type, topic: str, callback: Callable[[Any, float], None], qos: Any) -> None:
-        """Before `start`: take the messages of a topic.
-
-        :param callback: gets a message, and when it was published (s, Unix time).
-        """
+        """Before `start`: give a callback the messages of a topic, with when they were published (s, Unix time)."""
         subscription = self._node.create_subscription(kind, topic, lambda message: None, qos)
         self._subscriptions.append((subscription.handle, kind, callback))
 
     def start(self) -> None:
-        """Begin, if there is something to take."""
         if self._subscriptions:
             self._thread.start()
 
     def close(self) -> None:
-        """End of the thread and its node."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join(2.0)

@@ -1,18 +1,16 @@
 """Crazyradios and UDP ports as links of cflib, by its public interface: drivers that the bridge brings along.
 
 cflib's own driver over the air repeats one packet until it is acknowledged while all others wait behind it, closes the
-link after 100 missing acknowledgements, and its thread dies with the dongle. cflib's driver over UDP takes the error of
-a closed port for the end of the link. So here are drivers (`cflib.crtp.crtpdriver.CRTPDriver`) of our own:
+link after 100 missing acknowledgements, and its thread dies with the dongle; over UDP a closed port ends the link. Here
 
-- One thread a dongle serves its Crazyflies in turn, through `cflib.drivers.crazyradio.Crazyradio`.
-- A mailbox a Crazyflie has all commands in sequence, the newest set-point, the newest position, and requests that want
-  an answer (parameters, logs). Sending never waits. Commands come first; the others take turns.
-- With safelink a bit tells a new packet from a repetition. A packet is repeated until it is acknowledged, set-points
+- one thread a dongle serves its Crazyflies in turn, through `cflib.drivers.crazyradio.Crazyradio`;
+- a mailbox a Crazyflie has all commands in sequence, the newest set-point, the newest position, and requests that want
+  an answer (parameters, logs). Sending never waits. Commands come first; the others take turns;
+- with safelink a bit tells a new packet from a repetition. A packet is repeated until it is acknowledged, set-points
   and positions only for a short while and as long as there is no newer one. While nothing is acknowledged, perhaps
-  because only the acknowledgements are missing, commands are sent with either bit, one after the other: one counts.
-- A link never ends by itself. A dongle that is pulled is named; once it is there again its links go on.
-
-Set-points of port 3, of which `close_link` sends one, never leave.
+  because only the acknowledgements are missing, commands are sent with either bit, one after the other: one counts;
+- a link never ends by itself. A dongle that is pulled is named; once it is there again its links go on;
+- set-points of port 3, of which `close_link` sends one, never leave.
 
 Upstream: crazyflie-lib-python, issue 63 (links that close after missing acknowledgements), and crazyflie-link-cpp,
 issue 24 (set-points that are repeated although newer ones wait).
@@ -42,15 +40,15 @@ from .addresses import ANY, BITRATES, Address, parse_address
 
 Report = Callable[[str, str], None]  # level and line
 COMMAND, SETPOINT, POSITION, REQUEST, EMPTY = "command", "setpoint", "position", "request", "empty"
-TURNS = (SETPOINT, REQUEST, POSITION)
 NULL = b"\xff"
 SAFELINK, SAFELINK_TRIES = b"\xff\x05\x01", 10  # asks for the bits, and is answered by itself
 HEADER, UP_BIT, DOWN_BIT = 0xF3, 0x08, 0x04
 # By the supervisor's port, and by the localization's, where firmware before protocol version 12 has them.
 EMERGENCY, WATCHDOG = (b"\x91\x03", b"\x61\x03"), (b"\x91\x04", b"\x61\x04")
 END_OF_STREAM, HIGH_LEVEL, LEGACY_SETPOINT = 0x71, 0x80, 0x30
-COMMAND_LIFE_S, MOST_COMMANDS = 1.0, 20  # one that waited longer comes unexpected
 DEAF_S = 0.25  # nothing acknowledged for that long, though the dongle asks all the time
+MOST = {COMMAND: 20, REQUEST: None, SETPOINT: 1, POSITION: 1}  # that wait: of some the newest alone
+LIFE_S = {COMMAND: 1.0, REQUEST: math.inf, SETPOINT: DEAF_S, POSITION: DEAF_S}  # what waited longer comes unexpected
 RELAXED_S, BUSY_POLLS = 0.01, 10  # pause between polls once so many in a row were answered with nothing
 ABSENT_S, ABSENT_POLL_S = 1.0, 0.02  # pause between polls of one that has not answered for that long
 REOPEN_S = 0.3  # between attempts to find a dongle that has gone
@@ -62,7 +60,6 @@ FOREIGN_SHARE, FOREIGN_PACKETS = 0.25, 200  # so many packets repeated, of the l
 
 
 def kind_of(packet: bytes) -> str:
-    """Return how a packet to a Crazyflie is treated."""
     header, first = packet[0] & HEADER, packet[1] if len(packet) > 1 else -1
     if header == 0x70:
         return SETPOINT
@@ -72,49 +69,38 @@ def kind_of(packet: bytes) -> str:
 
 
 class Mailbox:
-    """What one Crazyflie is to be sent. For any thread."""
+    """What one Crazyflie is to be sent, by kind, with when it came (s, monotonic). For any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.commands: deque[tuple[bytes, float]] = deque(maxlen=MOST_COMMANDS)  # with when they came (s, monotonic)
-        self.requests: deque[bytes] = deque()
-        self._newest: dict[str, tuple[bytes, float]] = {}
-        self._turn = 0
-
-    def __bool__(self) -> bool:
-        return bool(self.commands or self.requests or self._newest)
+        self.waiting: dict[str, deque[tuple[bytes, float]]] = {kind: deque(maxlen=n) for kind, n in MOST.items()}
+        self._turns = [SETPOINT, REQUEST, POSITION]
 
     def add(self, packet: bytes) -> None:
         """Add a packet; an order ends the stream of set-points, an emergency stop empties the box."""
-        kind, start = kind_of(packet), bytes((packet[0] & HEADER, *packet[1:2]))
+        start, commands = bytes((packet[0] & HEADER, *packet[1:2])), self.waiting[COMMAND]
         with self._lock:
-            if kind == REQUEST:
-                self.requests.append(packet)
-            elif kind != COMMAND:
-                self._newest[kind] = packet, time.monotonic()
-            elif start not in WATCHDOG or all(packet != waiting for waiting, _ in self.commands):
-                if start in EMERGENCY:
-                    self.requests.clear()
-                    self.commands = deque((c for c in self.commands if c[0] == packet), MOST_COMMANDS)
-                if start in EMERGENCY or start[0] in (END_OF_STREAM, HIGH_LEVEL):
-                    self._newest.pop(SETPOINT, None)
-                self.commands.append((packet, time.monotonic()))
+            if start in EMERGENCY:
+                self.waiting[REQUEST].clear()
+                for other in [entry for entry in commands if entry[0] != packet]:
+                    commands.remove(other)
+            if start in EMERGENCY or start[0] in (END_OF_STREAM, HIGH_LEVEL):
+                self.waiting[SETPOINT].clear()
+            if start not in WATCHDOG or all(packet != waiting for waiting, _ in commands):
+                self.waiting[kind_of(packet)].append((packet, time.monotonic()))
 
     def pop(self, kind: str = "") -> tuple[str, bytes] | None:
         """Return the next packet, of one kind or of any, and its kind; None: there is none."""
         with self._lock:
             now = time.monotonic()
-            self._newest = {kind: both for kind, both in self._newest.items() if now - both[1] < DEAF_S}
-            while self.commands and kind in ("", COMMAND):
-                packet, since = self.commands.popleft()
-                if now - since < COMMAND_LIFE_S or packet[1:2] == b"\x03":
-                    return COMMAND, packet
-            for number in range(self._turn, self._turn + len(TURNS)):
-                turn = TURNS[number % len(TURNS)]
-                waits = self.requests if turn == REQUEST else turn in self._newest
-                if waits and kind in ("", turn):
-                    self._turn = (number + 1) % len(TURNS)
-                    return turn, self.requests.popleft() if turn == REQUEST else self._newest.pop(turn)[0]
+            for turn in [kind] if kind else [COMMAND, *self._turns]:
+                while self.waiting[turn]:
+                    packet, since = self.waiting[turn].popleft()
+                    if now - since < LIFE_S[turn] or (turn == COMMAND and packet[1:2] == b"\x03"):
+                        if turn != COMMAND:
+                            self._turns.remove(turn)
+                            self._turns.append(turn)
+                        return turn, packet
         return None
 
 
@@ -174,9 +160,9 @@ class RadioDriver(CRTPDriver):  # type: ignore[misc]
     def due(self, now: float) -> float:
         """Return when the next packet goes (s, monotonic)."""
         pause, absent = self._least_s, now - self._acknowledged > ABSENT_S and self._tries >= SAFELINK_TRIES
-        if absent and not self.mailbox.commands:
+        if absent and not self.mailbox.waiting[COMMAND]:
             pause = max(pause, ABSENT_POLL_S)
-        elif self._pending is None and not self.mailbox and self._empty_polls > BUSY_POLLS:
+        elif self._pending is None and self._empty_polls > BUSY_POLLS and not any(self.mailbox.waiting.values()):
             pause = max(pause, RELAXED_S)
         return self._last + pause
 
@@ -209,7 +195,7 @@ class RadioDriver(CRTPDriver):  # type: ignore[misc]
         elif now - self._acknowledged > DEAF_S:
             if (command := box.pop(COMMAND)) is not None:
                 if pending[0] == REQUEST:  # it may not have arrived
-                    box.requests.appendleft(pending[1])
+                    box.waiting[REQUEST].appendleft((pending[1], now))
                 pending, both = command, True
             elif pending[0] in (SETPOINT, POSITION):
                 pending = EMPTY, NULL  # too old
@@ -246,11 +232,7 @@ class RadioDriver(CRTPDriver):  # type: ignore[misc]
 
 
 class DongleThread(threading.Thread):
-    """A Crazyradio, and the thread that serves its Crazyflies in turn.
-
-    :param radio: number or serial.
-    :param names: of Crazyflies, by their links.
-    """
+    """A Crazyradio (number or serial), and the thread that serves its Crazyflies (names by link) in turn."""
 
     def __init__(self, radio: str, report: Report, names: dict[str, str]) -> None:
         super().__init__(name=f"radio {radio}", daemon=True)
@@ -258,7 +240,7 @@ class DongleThread(threading.Thread):
         self.foreign = False  # another radio sends on the channel, as it seems
         self._condition = threading.Condition()
         self._links: list[RadioDriver] = []
-        self._stops: deque[tuple[float, int, int]] = deque()  # when (s, monotonic), channel, rate of a stop of all
+        self._stops: list[tuple[float, int, int]] = []  # when (s, monotonic), channel, rate of a stop of all
         self._closing = False
         self._late, self._serial = 0, ""
         self._repeated: deque[bool] = deque()
@@ -287,31 +269,29 @@ class DongleThread(threading.Thread):
     def remove(self, link: RadioDriver) -> None:
         """Serve a link no more, once its commands are sent or have waited for long enough."""
         end = time.monotonic() + CLOSE_S
-        while self._device is not None and link.mailbox.commands and time.monotonic() < end:
+        while self._device is not None and link.mailbox.waiting[COMMAND] and time.monotonic() < end:
             time.sleep(0.005)
         with self._condition:
             self._links.remove(link)
             self._condition.notify()
 
     def wake(self) -> None:
-        """Tell the thread that there is something to send."""
         with self._condition:
             self._condition.notify()
 
     def stop_channel(self, channel: int, rate: int) -> None:
         """Stop all Crazyflies on a channel, again and again; does not wait."""
         now = time.monotonic()
-        self._stops.extend((now + k * PAUSE_S, channel, rate) for k in range(ROUNDS))
-        self.wake()
+        with self._condition:
+            self._stops = sorted([*self._stops, *((now + k * PAUSE_S, channel, rate) for k in range(ROUNDS))])
+            self._condition.notify()
 
     def close(self) -> None:
-        """End the thread."""
         self._closing = True
         self.wake()
         self.join(2.0)
 
     def run(self) -> None:
-        """Serve until it is closed."""
         turn = 0
         while not self._closing or self._stops:
             if self._device is None and not self._find():
@@ -323,7 +303,7 @@ class DongleThread(threading.Thread):
                 now, links = time.monotonic(), self._links[turn:] + self._links[:turn]
                 due = [link.due(now) for link in links]
                 ready = next((link for link, when in zip(links, due, strict=True) if when <= now), None)
-                stop = self._stops.popleft() if self._stops and self._stops[0][0] <= now else None
+                stop = self._stops.pop(0) if self._stops and self._stops[0][0] <= now else None
                 if ready is None and stop is None and (self._stops or not self._closing):
                     due += [when for when, _, _ in self._stops]
                     self._condition.wait(max(0.0, min(due) - now) if due else None)
@@ -382,7 +362,6 @@ class UdpDriver(CRTPDriver):  # type: ignore[misc]
     """A link over UDP, for simulated Crazyflies. It ends by errors only before something was heard over it."""
 
     def connect(self, uri: str, statistics: Any, error: Callable[[str], None] | None) -> None:
-        """Open the link."""
         if not uri.startswith("udp://"):
             raise WrongUriType("not UDP")
         address = parse_address(uri)
@@ -428,10 +407,7 @@ class UdpDriver(CRTPDriver):  # type: ignore[misc]
 class DongleSet:
     """The dongles of one bridge; cflib opens links by the drivers above until it is closed.
 
-    The first dongle that no link uses is kept for emergency stops.
-
-    :param robots: names and addresses.
-    :param report: called with a level and a line about dongles that come and go.
+    The first dongle that no link uses is kept for emergency stops. Dongles that come and go are reported.
     """
 
     def __init__(self, robots: Iterable[tuple[str, Address]], report: Report) -> None:
@@ -439,7 +415,7 @@ class DongleSet:
         self._names = {address.link: name for name, address in robots}
         self._addresses = [address for _, address in robots if address.radio]
         self._report = report
-        self._dongles: dict[str, DongleThread] = {}
+        self.dongles: dict[str, DongleThread] = {}
         self._lock = threading.Lock()
         self._drivers: list[Any] = [partial(RadioDriver, self), UdpDriver]
         cflib.crtp.CLASSES[:0] = self._drivers
@@ -449,9 +425,9 @@ class DongleSet:
         """Return the dongle of an address; raises an error if it is not there."""
         radio = self._radio(address)
         with self._lock:
-            if radio not in self._dongles:
-                self._dongles[radio] = DongleThread(radio, self._report, self._names)
-            return self._dongles[radio]
+            if radio not in self.dongles:
+                self.dongles[radio] = DongleThread(radio, self._report, self._names)
+            return self.dongles[radio]
 
     def _radio(self, address: Address) -> str:
         """Return the dongle of an address; of links that name none: one a channel, as far as there are dongles."""
@@ -477,11 +453,6 @@ class DongleSet:
         self._report("warn", "no radio is left for emergency stops: they go by the radios of the links")
         return None
 
-    @property
-    def foreign(self) -> list[str]:
-        """Dongles on whose channels another radio seems to send."""
-        return [name for name, dongle in sorted(self._dongles.items()) if dongle.foreign]
-
     def stop_all(self) -> None:
         """Stop all Crazyflies on the swarm's channels, by broadcast, again and again; does not wait."""
         for address in {(a.radio, a.channel, a.rate): a for a in self._addresses}.values():
@@ -490,7 +461,6 @@ class DongleSet:
                 dongle.stop_channel(address.channel, tuple(BITRATES).index(address.rate))
 
     def close(self) -> None:
-        """Close all dongles, and leave cflib as it was."""
         cflib.crtp.CLASSES[:] = [driver for driver in cflib.crtp.CLASSES if driver not in self._drivers]
-        for dongle in (*self._dongles.values(), *([self.spare] if self.spare else [])):
+        for dongle in (*self.dongles.values(), *([self.spare] if self.spare else [])):
             dongle.close()

@@ -16,7 +16,7 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from dtsa_agent.core.errors import ConfigError
 from .addresses import LinkError
 from .commands import Setpoint
 from .onboard import START, OnboardSetup, send_order
-from .positions import SettlingCheck
+from .positions import PoseTracker
 from .settings import RobotSettings
 from .state import LOG_VARIABLES, Vector, VehicleState, decode_log
 
@@ -33,13 +33,15 @@ SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Cra
 FIRST_ANSWER_S = 2.0  # over the air nothing else shows that no Crazyflie is there
 AUDIBLE_S = 0.25  # something came or was acknowledged within that time: it can be heard
 CLOSED_PORT_S = 10.0  # simulated Crazyflies that are started at the same time take so long to listen
-PAUSE_S = (0.1, 0.5)  # first and longest pause before a closed port is asked again
+PAUSE_S = 0.2  # before a closed port is asked again
 LOG_ORDER_S = 0.4  # nothing logged for that long, though it can be heard: the log is ordered anew
 REFUSED = f"[Errno {errno.ECONNREFUSED}]"  # in a driver's words: the port is closed
 VARIANCES = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
 PLACE = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")
 INITIAL = ("kalman.initialX", "kalman.initialY", "kalman.initialZ")
 VARIANCE_MS = 50
+MAX_DRIFT = 1e-4  # of the Crazyflie's clock against ours, at most
+RESTARTED_S = 5.0  # a stamp that is so far off is that of a Crazyflie that was switched on again
 RESET_S = 0.1  # the firmware's tasks have seen the parameter by then
 INTEGERS = "bBhHiIqQ"  # formats of `struct`
 
@@ -66,45 +68,19 @@ def require_cflib() -> None:
     warnings.filterwarnings("ignore", message="The supervisor subsystem requires CRTP", category=UserWarning)
 
 
-class LogClock:
-    """How old the values of a log packet are: after a gap the Crazyflie delivers what it logged meanwhile.
-
-    The smallest delay that was ever seen is that of a packet without a wait. Times (`now`) are s, monotonic.
-    """
-
-    MAX_DRIFT = 1e-4  # of the Crazyflie's clock against ours, at most
-    RESTARTED_S = 5.0  # a stamp that is so far off is that of a Crazyflie that was switched on again
-
-    def __init__(self) -> None:
-        self.last = -math.inf  # s, monotonic, when a log packet came
-        self._offset: float | None = None
-
-    def sampled(self, stamp_ms: int, now: float) -> float:
-        """Return when the values of a packet that has come now were taken; its time stamp is the Crazyflie's."""
-        offset = now - stamp_ms / 1000
-        if self._offset is None or abs(offset - self._offset) > self.RESTARTED_S:
-            self._offset = offset
-        else:
-            self._offset = min(offset, self._offset + self.MAX_DRIFT * (now - self.last))
-        self.last = now
-        return min(now, stamp_ms / 1000 + self._offset)
-
-
 class CrazyflieLink:
     """One Crazyflie's connection and log.
 
+    cflib's threads call `on_state` with each decoded log packet and when it was logged (s, monotonic), `on_broken` with
+    a reason when the link ends by itself, and `on_answer` with the first byte of a high-level order and its answer.
+
     :param cache: folder for the tables of variables.
-    :param on_state: called with each decoded log packet and when it was logged (s, monotonic), in a thread of cflib's.
-    :param on_broken: called with a reason when the connection ends by itself, in a thread of cflib's.
-    :param on_answer: called with the first byte of a high-level order and the firmware's answer, in such a thread.
-    :param settling: makes what decides when the estimator has settled.
-    :param measured_place: where motion capture sees the Crazyflie (m, world); None: not at all.
+    :param tracker: knows where motion capture sees the Crazyflie.
     """
 
     def __init__(
-        self, robot: RobotSettings, cache: Path, on_state: Callable[[VehicleState, float], None],
+        self, robot: RobotSettings, cache: Path, tracker: PoseTracker, on_state: Callable[[VehicleState, float], None],
         on_broken: Callable[[str], None], on_answer: Callable[[int, int], None],
-        settling: Callable[[], SettlingCheck], measured_place: Callable[[], Vector | None],
     ) -> None:  # fmt: skip
         self.robot = robot
         self.connected = False
@@ -112,21 +88,21 @@ class CrazyflieLink:
         self.acknowledged = -math.inf  # s, monotonic: when anything last came, or was acknowledged
         self.firmware: tuple[int, str] | None = None  # version of its protocol, and revision; None: never connected
         self.board: OnboardSetup | None = None  # what the app on board is told; None: there is none
+        self.driver: Any = None  # over a radio ours, which knows its quality (0 to 1) and rssi (-dBm)
         self.guarded = False  # the firmware's emergency watchdog wants to be fed as soon as it can be
         self.setpoints: deque[tuple[float, float]] = deque(maxlen=500)  # when sent (s, monotonic), s since it came
-        self._cache, self._settling, self._measured_place = cache, settling, measured_place
+        self._cache, self._tracker = cache, tracker
         self._on_state, self._on_broken, self._on_answer = on_state, on_broken, on_answer
         self._closed = False
         self._cf: Any = None
-        self.driver: Any = None  # over a radio ours, which knows its quality (0 to 1) and rssi (-dBm)
         self._settled, self._failure = threading.Event(), ""  # of the present attempt to connect
         self._stamp = 0.0  # s, monotonic, of the last streamed command
-        self._log_clock, self._logged = LogClock(), threading.Event()
+        self._logged, self._log_time = threading.Event(), -math.inf  # when a log packet came, s, monotonic
+        self._log_delay = math.inf  # s, from the Crazyflie's clock to ours, of a packet without a wait
         self._audible_since = self._log_ordered = -math.inf  # s, monotonic
         self._log_order_s = LOG_ORDER_S
         self._log_block: Any = None
 
-    # -- what goes out ----------------------------------------------------------------------------------------------
     @property
     def crazyflie(self) -> Any:
         """The connected `Crazyflie` of cflib; None: there is none."""
@@ -144,18 +120,17 @@ class CrazyflieLink:
         now = time.monotonic()
         self.setpoints.append((now, now - self._stamp))
 
-    def order(self, action: Send, cf: Any = None) -> None:
-        """Give an order, if there is a connection. Emergency stops go before everything that waits."""
-        if (cf := cf or self.crazyflie) is not None:
+    def order(self, action: Send, *, connecting: bool = False) -> None:
+        """Give an order, if there is a connection, or one that is `connecting` and has come so far as to take it.
+
+        Emergency stops go before everything that waits.
+        """
+        cf = self._cf if connecting else self.crazyflie
+        if cf is not None and (not connecting or cf.is_connected()):
             try:
                 action(cf)
             except Exception as error:  # cflib's, of a link that has just ended
                 self._on_broken(f"could not send: {error}")
-
-    def send_position(self, send: Send) -> None:
-        """Send where motion capture sees it, while it connects, too: the estimator settles by that."""
-        if (cf := self._cf) is not None and cf.is_connected():
-            self.order(send, cf)
 
     @property
     def can_set(self) -> bool:
@@ -183,25 +158,21 @@ class CrazyflieLink:
                 found[full_name] = element, self.robot.firmware_params.get(full_name, read)
         return found
 
-    # -- connection -------------------------------------------------------------------------------------------------
     def connect(self) -> str:
         """Connect, in the calling thread; why it failed, or an empty text."""
         attempts, attempt, reason = self.robot.connect_attempts, 1, "the link has been closed"
-        pause, longest = PAUSE_S
         patience = time.monotonic() + min(CLOSED_PORT_S, self.robot.connect_timeout_s)
         while attempt <= attempts and not self._closed:
             try:
                 self._connect()
                 return ""
-            except LinkError as error:  # noqa: PERF203
+            except LinkError as error:
                 reason = f"attempt {attempt} of {attempts}: {error}"
-                self._drop()
-                # A closed port says so at once: that is no attempt as long as it may be about to be opened.
-                closed = REFUSED in reason and time.monotonic() < patience
-                attempt += not closed
-                if closed:
-                    time.sleep(pause)
-                    pause = min(2 * pause, longest)
+            self._drop()
+            # A closed port says so at once: that is no attempt as long as it may be about to be opened.
+            closed = REFUSED in reason and time.monotonic() < patience
+            attempt += not closed
+            time.sleep(PAUSE_S if closed else 0.0)
         return reason
 
     def _connect(self) -> None:
@@ -226,11 +197,11 @@ class CrazyflieLink:
             raise LinkError(self._failure)
         if self.robot.address.radio:
             cf.link_statistics.stop()  # its pings take air; elsewhere they tell that the Crazyflie is there
-        for name, value in self.robot.firmware_params.items():
-            try:
+        try:
+            for name, value in self.robot.firmware_params.items():
                 cf.param.set_value(name, value)
-            except (KeyError, AttributeError) as error:  # noqa: PERF203
-                raise LinkError(f"firmware parameter {name}: {error}") from error
+        except (KeyError, AttributeError) as error:
+            raise LinkError(f"firmware parameter {name}: {error}") from error
         if self.board is not None:
             self.board.prepare(cf)
         if self.robot.reset_estimator:
@@ -293,33 +264,28 @@ class CrazyflieLink:
 
         :raises LinkError: it does not settle in time, and why.
         """
-        from cflib.crazyflie.log import LogConfig
-
-        check, settled, timeout = self._settling(), threading.Event(), self.robot.estimator_timeout_s
+        settled, timeout, places = threading.Event(), self.robot.estimator_timeout_s, list[Vector]()
         problem = "the firmware logs nothing about it"
 
-        def sample(stamp: int, values: dict[str, float], block: Any) -> None:
+        def sample(stamp_ms: int, values: dict[str, float], block: Any) -> None:
             nonlocal problem
-            x, y, z = (values[name] for name in PLACE)
-            problem = check.find_problem((x, y, z), max(values[name] for name in VARIANCES), self._measured_place())
+            x, y, z, *variances = (values[name] for name in (*PLACE, *VARIANCES))
+            places.append((x, y, z))
+            limit = self.robot.estimator_variance_m2
+            problem = self._tracker.why_not_settled(places, max(variances), limit, time.monotonic())
             if not problem:
                 settled.set()
 
-        if (place := self._measured_place()) is not None:  # the filter begins where it is seen, not metres away
-            for name, value in zip(INITIAL, place, strict=True):
-                cf.param.set_value(name, value)
+        place = self._tracker.measured_position(time.monotonic())
+        for name, value in zip(INITIAL, place or (), strict=False):  # the filter begins where it is seen
+            cf.param.set_value(name, value)
         cf.param.set_value("kalman.resetEstimation", 1)
         time.sleep(RESET_S)
         cf.param.set_value("kalman.resetEstimation", 0)
-        block = LogConfig("variance", VARIANCE_MS)
-        for name in (*VARIANCES, *PLACE):
-            block.add_variable(name, "float")
-        block.data_received_cb.add_callback(sample)
         try:
-            cf.log.add_config(block)
+            block = _log(cf, "variance", VARIANCE_MS, (*VARIANCES, *PLACE), sample, "float")
         except KeyError:
             return  # another estimator than the Kalman filter: nothing to wait for
-        block.start()
         settled.wait(timeout)
         block.delete()
         if not settled.is_set():
@@ -330,43 +296,44 @@ class CrazyflieLink:
 
         From then on the bridge asks seldom: its packets take air from the agents.
         """
-        cf, board = self.crazyflie, self.board
-        if cf is None or board is None:
+        if (cf := self.crazyflie) is None or self.board is None:
             return "not connected"
         try:
             send_order(cf, START)
         except LinkError as error:
             return str(error)
         if self.driver is not None:
-            self.driver.limit(board.polls_hz)
+            self.driver.limit(self.board.polls_hz)
             # An order takes some packets of each way, and the log comes seldom.
-            self._log_order_s = LOG_ORDER_S + 1.0 / self.robot.log_rate_hz + 5.0 / board.polls_hz
+            self._log_order_s = LOG_ORDER_S + 1.0 / self.robot.log_rate_hz + 5.0 / self.board.polls_hz
         return ""
 
-    # -- log --------------------------------------------------------------------------------------------------------
     def _begin_log(self, cf: Any) -> None:
-        from cflib.crazyflie.log import LogConfig
-
-        block = LogConfig("state", max(10, round(1000 / self.robot.log_rate_hz / 10) * 10))
-        for name in LOG_VARIABLES:
-            block.add_variable(name)
-
-        def receive(stamp: int, values: dict[str, float], config: Any) -> None:
+        def receive(stamp_ms: int, values: dict[str, float], block: Any) -> None:
             self.received += 1
-            self._on_state(decode_log(values), self._log_clock.sampled(stamp, time.monotonic()))
+            self._on_state(decode_log(values), self._sampled(stamp_ms / 1000, time.monotonic()))
             self._logged.set()
 
-        block.data_received_cb.add_callback(receive)
+        period_ms = max(10, round(1000 / self.robot.log_rate_hz / 10) * 10)
         try:
-            cf.log.add_config(block)
+            self._log_block = _log(cf, "state", period_ms, LOG_VARIABLES, receive)
         except KeyError as error:
             raise LinkError(f"the firmware does not log {error}: update it") from error
-        block.start()
-        self._log_block = block
+
+    def _sampled(self, stamp: float, now: float) -> float:
+        """Return when the values of a log packet were taken (s, monotonic); its time stamp (s) is the Crazyflie's.
+
+        After a gap the Crazyflie delivers what it logged meanwhile: packets that come are not always new.
+        """
+        delay, passed = now - stamp, now - self._log_time
+        restarted = abs(delay - self._log_delay) > RESTARTED_S
+        self._log_delay = delay if restarted else min(delay, self._log_delay + MAX_DRIFT * passed)
+        self._log_time = now
+        return min(now, stamp + self._log_delay)
 
     def order_log(self, now: float) -> None:
         """Order the log anew, if it can be heard now (s, monotonic): the firmware ends it in a gap of a second."""
-        last = max(self._log_clock.last, self._audible_since, self._log_ordered)
+        last = max(self._log_time, self._audible_since, self._log_ordered)
         if now - self.acknowledged > AUDIBLE_S or now - last < self._log_order_s:
             return
         self._log_ordered = now
@@ -379,7 +346,6 @@ class CrazyflieLink:
 
         self.order(order)
 
-    # -- end --------------------------------------------------------------------------------------------------------
     def _drop(self) -> None:
         self.connected = False
         cf, self._cf = self._cf, None
@@ -393,3 +359,16 @@ class CrazyflieLink:
         self._closed, self._failure = True, "the link has been closed"
         self._settled.set()
         self._drop()
+
+
+def _log(cf: Any, name: str, period_ms: int, variables: Iterable[str], receive: Callable[..., None], *kind: str) -> Any:
+    """Begin a log block of cflib's; KeyError: the firmware has not all of these variables."""
+    from cflib.crazyflie.log import LogConfig
+
+    block = LogConfig(name, period_ms)
+    for variable in variables:
+        block.add_variable(variable, *kind)
+    block.data_received_cb.add_callback(receive)
+    cf.log.add_config(block)
+    block.start()
+    return block

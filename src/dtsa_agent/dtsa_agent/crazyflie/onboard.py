@@ -69,10 +69,9 @@ def check_onboard_swarm(swarm: SwarmConfig) -> None:
     """Check that the app can fly a swarm; ConfigError: it cannot."""
     if swarm.agents > MAX_AGENTS:
         raise ConfigError("agents", swarm.agents, f"1 to {MAX_AGENTS} on board")
-    if swarm.policy not in POLICIES:
-        raise ConfigError("policy", swarm.policy, ", ".join(POLICIES))
-    if swarm.estimator not in ESTIMATORS:
-        raise ConfigError("estimator", swarm.estimator, f"{', '.join(ESTIMATORS)} on board")
+    for name, known in (("policy", POLICIES), ("estimator", ESTIMATORS)):
+        if getattr(swarm, name) not in known:
+            raise ConfigError(name, getattr(swarm, name), f"{', '.join(known)} on board")
     check_fits(swarm, PORT)
 
 
@@ -99,10 +98,7 @@ def app_parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dic
 
 
 def key_of(swarm: SwarmConfig) -> bytes:
-    """Return the key of signed frames, from the environment; empty if frames are not signed.
-
-    :raises ConfigError: there is no key of 16 bytes, or no session.
-    """
+    """Return the environment's key of signed frames, or nothing; ConfigError: not 16 bytes, or no session."""
     check_session(swarm)
     signing = authenticator(swarm)
     key = b"" if signing is None else signing.key_and_session[0]
@@ -112,10 +108,7 @@ def key_of(swarm: SwarmConfig) -> bytes:
 
 
 def app_orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[bytes]:
-    """Return the orders that set up the app: random key of the policy, starts and goals of all agents, signing key.
-
-    :param key: 16 bytes, if frames are signed.
-    """
+    """Return the orders that set up the app: random key of the policy, all starts and goals, signing key (16 bytes)."""
     packets = [b"D" + struct.pack("<Q", policy_key(swarm.seed))]
     for letter, places in ((b"F", scenario.start), (b"T", scenario.target)):
         for k in range(swarm.agents):

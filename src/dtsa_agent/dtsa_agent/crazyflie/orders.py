@@ -63,7 +63,7 @@ class RepeatedOrder:
     answered: bool = False
     busy: int = 0  # answers that the supervisor lets no motor run
 
-    def take_answer(self, code: int, result: int) -> str:
+    def note_answer(self, code: int, result: int) -> str:
         """Take an answer to an order (its first byte), 0 or an errno; why this one is refused for good, or ""."""
         if KINDS.get(code) != self.kind or self.answered:
             return ""

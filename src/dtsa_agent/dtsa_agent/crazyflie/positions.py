@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from dtsa_agent.core.settings.declaration import Settings, setting
 
-from .state import Quaternion, Vector, outside_by, place_text, to_map, to_world
+from .safety import SafetySettings, outside_fence
+from .state import Quaternion, Vector, place_text, to_world
 
 NONE, POSE, NAMED_POSES = "none", "pose", "named_poses"
 EXTPOS, EXTPOSE = "extpos", "extpose"
@@ -27,8 +29,6 @@ POSES_AFTER_JUMP = 20  # that agree: then the vehicle was carried on the ground,
 FRESH_POSE_S = 0.3  # an older pose no longer tells where the vehicle is
 ROOM_MARGIN_M = 0.3  # by which a pose or an estimate may lie outside the geofence
 SETTLED_SAMPLES, SETTLED_SPREAD_M = 5, 0.05  # a settled estimate moves less than this over so many samples
-
-Room = tuple[Vector, Vector]  # lower and upper corner, m, frame map
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,16 +61,13 @@ class PositionSettings(Settings):
 
     @property
     def enabled(self) -> bool:
-        """Whether there is motion capture."""
         return self.source != NONE
 
     def topic_of(self, name: str) -> str:
-        """Return the topic of a Crazyflie's poses."""
         return (self.topic or ("/{name}/pose" if self.source == POSE else "/poses")).replace("{name}", name)
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredPose:
+class MeasuredPose(NamedTuple):
     """A pose of motion capture that passed the checks."""
 
     position: Vector  # m, world
@@ -85,15 +82,14 @@ class RefusedPose(Exception):
 
 @dataclass(slots=True)
 class PoseTracker:
-    """Checks the poses of one Crazyflie, and keeps the last accepted one.
+    """Checks the poses of one Crazyflie, keeps the last accepted one, and compares its estimates with it.
 
     :param origin: m, of frame `map` in the Crazyflies' world.
-    :param room: corners of a box (m, map); poses more than ROOM_MARGIN_M outside are refused; None: no limits.
     """
 
     settings: PositionSettings
+    safety: SafetySettings
     origin: Vector
-    room: Room | None
     last: MeasuredPose | None = None
     refused: Counter[str] = field(default_factory=Counter)
     reason: str = ""  # why the last pose was refused; empty: it was accepted
@@ -105,7 +101,7 @@ class PoseTracker:
     _next_send: float = -math.inf
 
     def receive_pose(
-        self, position: Vector, orientation: Quaternion, frame: str, stamp: float, now: float, *, flying: bool
+        self, position: Vector, orientation: Sequence[float], frame: str, stamp: float, now: float, *, flying: bool
     ) -> str:
         """Check a pose (m, in `frame`: `world`, also empty, or `map`); return why it is refused, empty if it is not.
 
@@ -132,7 +128,7 @@ class PoseTracker:
         return ""
 
     def _check_alone(
-        self, position: Vector, orientation: Quaternion, frame: str, stamp: float, now: float, *, flying: bool
+        self, position: Vector, orientation: Sequence[float], frame: str, stamp: float, now: float, *, flying: bool
     ) -> MeasuredPose:
         """Check what a pose says by itself: frame, room, attitude; RefusedPose: it is impossible."""
         if frame not in ("", "world", "map"):
@@ -140,7 +136,7 @@ class PoseTracker:
         if not all(map(math.isfinite, (*position, *orientation))):
             raise RefusedPose("not finite", "the pose is not finite")
         place = to_world(position, self.origin) if frame == "map" else position
-        if outside := outside_room(place, self.origin, self.room):
+        if outside := outside_fence(place, self.safety, self.origin, ROOM_MARGIN_M):
             raise RefusedPose("outside", outside)
         if self.settings.send != EXTPOSE:
             return MeasuredPose(place, None, stamp, now)
@@ -209,7 +205,6 @@ class PoseTracker:
         return math.inf if self.last is None else now - self.last.time
 
     def rate_hz(self, now: float) -> float:
-        """Return the number of poses accepted in the last second."""
         return float(sum(now - t <= 1.0 for t in self._times.copy()))
 
     def measured_position(self, now: float) -> Vector | None:
@@ -218,6 +213,8 @@ class PoseTracker:
 
     def why_estimate_wrong(self, estimate: Vector, now: float) -> str:
         """Return why a vehicle with this estimate of its position (m, world) may not start; empty if it may."""
+        if not self.settings.enabled:
+            return ""
         measured = self.measured_position(now)
         if measured is None:
             return f"is not seen by motion capture ({self.reason or 'no pose comes'})"
@@ -225,55 +222,36 @@ class PoseTracker:
         where = f"{error:.2f} m from where it believes to be (limit {limit:g} m)"
         return "" if error <= limit else f"is seen {where}: reconnect it"
 
+    def why_not_settled(self, places: Sequence[Vector], variance: float, limit: float, now: float) -> str:
+        """Return why an estimator has not settled after a restart; empty if it has: steady, inside the room, accurate.
+
+        With motion capture the estimate must agree with the measured position; without, its variances must be small.
+
+        :param places: m, world, the last estimates.
+        :param variance: the largest one, m^2, and its limit.
+        """
+        place, measured, agree_m = places[-1], self.measured_position(now), self.settings.agree_m
+        where = place_text(place)
+        if not all(map(math.isfinite, (*place, variance))):
+            return f"its estimate is not finite {where}"
+        if self.settings.enabled:
+            if measured is None:
+                return "motion capture does not see it"
+            if (error := math.dist(place, measured)) > agree_m:
+                at = place_text(measured)
+                return f"it believes to be at {where}, motion capture sees it {error:.2f} m away at {at}"
+        elif variance > limit:
+            return f"variance {variance:.3g} m^2, limit {limit:g} m^2, at {where}"
+        if outside := outside_fence(place, self.safety, self.origin, ROOM_MARGIN_M):
+            return f"it believes to be outside: {outside}"
+        last = places[-SETTLED_SAMPLES:]
+        spread = max(math.dist(place, p) for p in last)
+        if len(last) < SETTLED_SAMPLES or spread > SETTLED_SPREAD_M:
+            return f"its place moves by {spread:.2f} m, at {where}"
+        return ""
+
 
 def quantile(values: deque[float], share: float) -> float:
     """Return a quantile of what other threads may add to; 0: there is nothing."""
     ordered = sorted(values.copy())
     return ordered[int(share * (len(ordered) - 1))] if ordered else 0.0
-
-
-def outside_room(place: Vector, origin: Vector, room: Room | None) -> str:
-    """Return how a place (m, world) is outside a room (m, map; None: no limits), with a margin; empty if it is not."""
-    for away, axis in outside_by(to_map(place, origin), *room) if room is not None else ():
-        if away > ROOM_MARGIN_M:
-            return f"{place_text(place)} in the world is {away:.2f} m outside the room in {axis}"
-    return ""
-
-
-@dataclass(slots=True)
-class SettlingCheck:
-    """Decides when the estimator of a Crazyflie has settled after a restart: steady, inside the room, and accurate.
-
-    With motion capture, the estimate must agree with the measured position; without, its variances must be small.
-
-    :param variance_limit: m^2.
-    :param agree_m: m, largest distance from the measured position; None: there is no motion capture.
-    """
-
-    variance_limit: float
-    origin: Vector
-    room: Room | None
-    agree_m: float | None
-    _places: deque[Vector] = field(default_factory=lambda: deque(maxlen=SETTLED_SAMPLES))
-
-    def find_problem(self, place: Vector, variance: float, measured: Vector | None) -> str:
-        """Return why it has not settled, by one more estimate (m, world), its largest variance (m^2) and position."""
-        self._places.append(place)
-        where = place_text(place)
-        if not all(map(math.isfinite, (*place, variance))):
-            return f"its estimate is not finite {where}"
-        if self.agree_m is not None:
-            if measured is None:
-                return "motion capture does not see it"
-            error = math.dist(place, measured)
-            if error > self.agree_m:
-                at = place_text(measured)
-                return f"it believes to be at {where}, motion capture sees it {error:.2f} m away at {at}"
-        elif variance > self.variance_limit:
-            return f"variance {variance:.3g} m^2, limit {self.variance_limit:g} m^2, at {where}"
-        if outside := outside_room(place, self.origin, self.room):
-            return f"it believes to be outside: {outside}"
-        spread = max(math.dist(place, p) for p in self._places)
-        if len(self._places) < SETTLED_SAMPLES or spread > SETTLED_SPREAD_M:
-            return f"its place moves by {spread:.2f} m, at {where}"
-        return ""

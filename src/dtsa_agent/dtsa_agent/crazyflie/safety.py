@@ -23,6 +23,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
@@ -99,22 +100,20 @@ class SafetySettings(Settings):
                 raise ConfigError("geofence_min", list(self.geofence_min), f"below geofence_max in {axis}")
 
 
-def outside_fence(place: Vector, safety: SafetySettings, origin: Vector) -> str:
+def outside_fence(place: Vector, safety: SafetySettings, origin: Vector, margin: float | None = None) -> str:
     """How a place (m, world) is outside the geofence; empty if it is not, or if there is no fence.
 
     :param origin: m, where the world sees the origin of `map`.
+    :param margin: m, that it may be outside; None: the fence's tolerance.
     """
-    if not safety.geofence:
-        return ""
     here = to_map(place, origin)
-    for away, axis in outside_by(here, safety.geofence_min, safety.geofence_max):
-        if away > safety.geofence_tolerance_m:
-            return f"{place_text(here)} is {away:.2f} m outside the geofence in {axis}"
-    return ""
+    away, axis = max(outside_by(here, safety.geofence_min, safety.geofence_max))
+    if not safety.geofence or away <= (safety.geofence_tolerance_m if margin is None else margin):
+        return ""
+    return f"{place_text(here)} is {away:.2f} m outside the geofence in {axis}"
 
 
-@dataclass(frozen=True, slots=True)
-class WatchedVehicle:
+class WatchedVehicle(NamedTuple):
     """What the rules need to know about one vehicle."""
 
     name: str
@@ -130,8 +129,7 @@ class WatchedVehicle:
     wrong_s: float = 0.0  # s, for how long
 
 
-@dataclass(frozen=True, slots=True)
-class RequiredAction:
+class RequiredAction(NamedTuple):
     """Something has to be done."""
 
     name: str  # the vehicle; empty: all

@@ -105,7 +105,6 @@ class RobotSettings(Settings):
 
     @property
     def address(self) -> Address:
-        """The URI's parts."""
         return parse_address(self.uri)
 
 
@@ -216,15 +215,16 @@ def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
     """Check robots and station for a swarm whose agents run on board."""
     station, (x_origin, y_origin, _) = settings.station, settings.station.room_origin_in_world
     rate, start = station.on_board.polls_hz, make_scenario(swarm).start
-    if station.positions.enabled:
-        allowed = f"{NONE} with on_board: poses to the Crazyflies would take their air"
-        raise ConfigError("station.positions.source", station.positions.source, allowed)
-    if x_origin or y_origin:
-        allowed = "0, 0, z with on_board: the app knows a height alone"
-        raise ConfigError("station.room_origin_in_world", list(station.room_origin_in_world), allowed)
-    if station.safety.min_distance_m:
-        allowed = "0 with on_board: places that come so seldom are too old for it; the agents keep apart themselves"
-        raise ConfigError("station.safety.min_distance_m", station.safety.min_distance_m, allowed)
+    for name, value, wrong, allowed in (
+        ("positions.source", station.positions.source, station.positions.enabled,
+         f"{NONE}: poses to the Crazyflies would take their air"),
+        ("room_origin_in_world", list(station.room_origin_in_world), x_origin or y_origin,
+         "0, 0, z: the app knows a height alone"),
+        ("safety.min_distance_m", station.safety.min_distance_m, station.safety.min_distance_m,
+         "0: places that come so seldom are too old for it; the agents keep apart themselves"),
+    ):  # fmt: skip
+        if wrong:
+            raise ConfigError(f"station.{name}", value, f"with on_board {allowed}")
     for index, robot in enumerate(settings.robots):
         field = f"robots.{robot.name}"
         if robot.id != index + 1:

@@ -1,10 +1,5 @@
 """State reports of a Crazyflie in ROS's units (REP-103: m, rad, x forward, y left, z up), and its state machine.
 
-The firmware differs: its compressed state log counts in mm, mm/s and mrad/s, and `stateEstimate.pitch` has the opposite
-sign (nose up is positive there, nose down in REP-103). Module `commands` converts commands to the firmware.
-
-States, as the ground station sees them:
-
     disconnected --> connecting --> ready <--> armed --> flying --> landing --> ready
                                       |          |         |           |
                                       +----------+---------+-----------+--> lost       (silent for too long)
@@ -20,7 +15,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
@@ -31,8 +26,7 @@ LOG_VARIABLES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class VehicleState:
+class VehicleState(NamedTuple):
     """One state report of a Crazyflie."""
 
     position: Vector  # m, world
@@ -43,10 +37,7 @@ class VehicleState:
 
 
 def decode_log(values: Mapping[str, float]) -> VehicleState:
-    """Return the state report in one log packet.
-
-    :param values: by the names in `LOG_VARIABLES`, in the firmware's units.
-    """
+    """Return the state report in one log packet; values by the names in `LOG_VARIABLES`, in the firmware's units."""
     x, y, z, vx, vy, vz, quaternion, millivolt, info = (values[name] for name in LOG_VARIABLES)
     place, velocity = (x * 0.001, y * 0.001, z * 0.001), (vx * 0.001, vy * 0.001, vz * 0.001)
     return VehicleState(place, velocity, decompress_quaternion(int(quaternion)), millivolt * 0.001, int(info))
@@ -104,7 +95,6 @@ def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
     return (v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx)
 
 
-# -- states ---------------------------------------------------------------------------------------------------------
 CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
 IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
 HL_ACTIVE = 256  # the high-level commander flies a trajectory
@@ -126,14 +116,11 @@ class State(enum.IntEnum):
 CONNECTED = frozenset({State.READY, State.ARMED, State.FLYING, State.LANDING, State.EMERGENCY})
 IN_AIR = frozenset({State.FLYING, State.LANDING})
 OFF = frozenset({State.DISCONNECTED, State.CONNECTING})
-WATCHED_OVER = frozenset({State.ARMED, *IN_AIR})
+WATCHED = frozenset({State.ARMED, *IN_AIR})
 
 
 class StateMachine:
-    """State of one Crazyflie, and the reason for it.
-
-    :param on_change: called with the state before, the state now and the reason.
-    """
+    """State of one Crazyflie; `on_change` is called with the state before, the state now and the reason for it."""
 
     def __init__(self, on_change: Callable[[State, State, str], None]) -> None:
         self.state = State.DISCONNECTED
@@ -145,7 +132,6 @@ class StateMachine:
         self._stopped = False  # an emergency stop was sent
 
     def enter(self, state: State, reason: str) -> None:
-        """Enter a state."""
         if state == self.state:
             return
         before, self.state, self.reason = self.state, state, reason
@@ -161,19 +147,16 @@ class StateMachine:
         self.reason = reason
 
     def note_landing(self, reason: str) -> None:
-        """Note that a landing was ordered."""
         self._landing = True
         if self.state in (State.FLYING, State.ARMED, State.READY):
             self.enter(State.LANDING, reason)
 
     def note_emergency_stop(self, reason: str) -> None:
-        """Note that an emergency stop was ordered."""
         self._stopped = True
         if self.state not in OFF:
             self.enter(State.EMERGENCY, reason)
 
     def note_lost_link(self, reason: str) -> None:
-        """Note that no packet arrived for too long, or that the link broke."""
         if self.state in CONNECTED:
             self.enter(State.LOST, reason)
 

@@ -1,20 +1,19 @@
 """One Crazyflie as the bridge knows it: its connection, what is known of it, the orders it takes, and what it flies.
 
-A set-point's way from the graph to the motors, and what may stop it:
+A set-point's way from the graph to the motors, and what may stop it. All the files on it: `topics`, `commands`,
+`state`, `safety`, `vehicle`, `link`, `drivers`.
 
-1. **Topic.** `commands` reads each vehicle's `cmd_*` topics (`node/topics`) in a thread of its own, turns a message
-   into a `Setpoint` in the Crazyflies' world (`state`), dated by its publication, and refuses one that is too fast or
-   leads out of the fence (`safety`).
-2. **Whether it counts now** is decided here, in :meth:`CrazyflieVehicle.command`. It does not count unless the vehicle
-   is armed or flies, after a safety rule has taken the controls (`overruled`, until the next take-off), while motion
-   capture does not see the vehicle (`paused`), or while a take-off or go-to is flown to its end (`guard_until`). One
-   that counts ends whatever else was flown: a braking, an order that is being repeated.
+1. **Topic.** `commands` reads each vehicle's `cmd_*` topics (`node/topics`) in a thread of its own, and turns a message
+   into a `Setpoint` in the Crazyflies' world (`state`), dated by its publication.
+2. **Whether it counts now** is decided here, in :meth:`CrazyflieVehicle.command`. It does not count if it is too fast
+   or leads out of the fence (`safety`), unless the vehicle is armed or flies, after a safety rule has taken the
+   controls (`_overruled`, until the next take-off), while motion capture does not see the vehicle (`_paused`), or while
+   a take-off or go-to is flown to its end (`_guard_until`). One that counts ends whatever else was flown: a braking, an
+   order that is being repeated.
 3. **The link** (`link`) gives it to cflib, whose driver (`drivers`) keeps the newest one until it can be sent.
 4. **When the stream stops.** `safety` checks the command's age 50 times a second: first the vehicle holds its place
    (`hold_place`), then it lands (`land`). Both brake by a stream of zero velocity, then give an order to the firmware's
    high-level commander. The order goes out before the end of the stream, or the motors would stop for a moment.
-
-These are all the files on its way: `topics`, `commands`, `state`, `safety`, `vehicle`, `link`, `drivers`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,23 +30,10 @@ from .commands import Setpoint, velocity_world
 from .link import CrazyflieLink, Send
 from .onboard import ENABLE
 from .orders import GO_TO, LAND, REPEAT_S, TAKEOFF, RepeatedOrder, end_of_stream, landing_s, too_short
-from .positions import PoseTracker, SettlingCheck, quantile
+from .positions import PoseTracker, quantile
 from .safety import EstimateWatch, WatchedVehicle, outside_fence
 from .settings import GroundStationSettings, RobotSettings
-from .state import (
-    HL_ACTIVE,
-    IN_AIR,
-    IS_FLYING,
-    OFF,
-    WATCHED_OVER,
-    Quaternion,
-    State,
-    StateMachine,
-    Vector,
-    VehicleState,
-    to_map,
-    yaw_of,
-)
+from .state import HL_ACTIVE, IN_AIR, IS_FLYING, OFF, WATCHED, State, StateMachine, Vector, VehicleState, to_map, yaw_of
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
@@ -86,20 +72,14 @@ class CrazyflieVehicle:
         self.guarded = False  # the firmware's emergency watchdog is running
         self.last: VehicleState | None = None  # what it has reported last
         self.refused = 0  # streamed commands that did not count
+        self.longer = ""  # that the last landing takes longer than ordered, and why
         self._log, self._publish = log, on_state
         self._log_times: deque[float] = deque(maxlen=200)
         self._trusted_height = 0.0  # m, the last one before the estimate was wrong
         self._complained = -math.inf
-        safety, positions, origin = station.safety, station.positions, station.room_origin_in_world
-        room = (safety.geofence_min, safety.geofence_max) if safety.geofence else None
-        self.tracker = PoseTracker(positions, origin, room) if positions.enabled else None  # None: no motion capture
-        self._watch = EstimateWatch(safety)
-        agree_m = positions.agree_m if positions.enabled else None
-        self.link = CrazyflieLink(
-            robot, cache, self._on_state, self._on_broken, self._on_answer,
-            lambda: SettlingCheck(robot.estimator_variance_m2, origin, room, agree_m),
-            lambda: self._measured_place(time.monotonic()),
-        )  # fmt: skip
+        self.tracker = PoseTracker(station.positions, station.safety, station.room_origin_in_world)
+        self._watch = EstimateWatch(station.safety)
+        self.link = CrazyflieLink(robot, cache, self.tracker, self._on_state, self._on_broken, self._on_answer)
         # What it flies: a stream of commands, a path, a landing, or a velocity without a place.
         self._overruled = False  # a rule took the controls: streamed commands do not count until the next take-off
         self._paused = False  # held because it is not seen: streamed commands do not count until it is
@@ -115,7 +95,6 @@ class CrazyflieVehicle:
 
     @property
     def state(self) -> State:
-        """Where the state machine stands."""
         return self.machine.state
 
     @property
@@ -126,9 +105,6 @@ class CrazyflieVehicle:
         return self.state.name.lower()
 
     # -- what comes in ----------------------------------------------------------------------------------------------
-    def _log_info(self, text: str) -> None:
-        self._log("info", f"{self.name}: {text}")
-
     def _changed(self, before: State, state: State, reason: str) -> None:
         level = "error" if state in (State.EMERGENCY, State.LOST) else "info"
         self._log(level, f"{self.name}: {before.name.lower()} -> {state.name.lower()} ({reason})")
@@ -145,7 +121,7 @@ class CrazyflieVehicle:
                 return  # it delivers what it logged in the gap; what comes next is new
             if not self._watch.wrong:
                 self._trusted_height = max(state.position[2], 0.0)
-            if self._watch.update(state, now, self._measured_place(now), flying=bool(state.info & IS_FLYING)):
+            if self._watch.update(state, now, self.tracker.measured_position(now), flying=bool(state.info & IS_FLYING)):
                 self._log("error", f"{self.name}: {self._watch.wrong}")
             if self.state not in OFF:
                 before = self.state
@@ -164,13 +140,13 @@ class CrazyflieVehicle:
         if state.position[2] < LOW_M and not state.info & HL_ACTIVE:
             self._end_stream()  # down, or about to be
         elif drifts or not self._landing_answered:
-            self._log_info("heard again: brakes and lands")
+            self._log("info", f"{self.name}: heard again: brakes and lands")
             self._streaming = True
             self._brake_then(self._descend)
 
     def _on_answer(self, code: int, result: int) -> None:
         with self.lock:
-            problem = self._order.take_answer(code, result) if self._order else ""
+            problem = self._order.note_answer(code, result) if self._order else ""
             if problem:
                 self._order = None
                 self._log("warn", f"{self.name}: the firmware {problem}")
@@ -179,11 +155,9 @@ class CrazyflieVehicle:
         with self.lock:
             self.machine.note_lost_link(reason)
 
-    def receive_pose(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> None:
+    def receive_pose(self, position: Vector, orientation: Sequence[float], frame: str, stamp: float) -> None:
         """Check a pose from motion capture (see `PoseTracker.receive_pose`), and pass it on to the Crazyflie."""
         tracker, now = self.tracker, time.monotonic()
-        if tracker is None:
-            return
         with self.lock:
             flying = self.last is not None and bool(self.last.info & IS_FLYING)
             problem = tracker.receive_pose(position, orientation, frame, stamp, now, flying=flying)
@@ -192,19 +166,13 @@ class CrazyflieVehicle:
                 self._log("warn", f"{self.name}: a pose of motion capture is refused: {problem}")
             due = not problem and tracker.is_due(now)
         if due:
-            self.link.send_position(tracker.send)
+            self.link.order(tracker.send, connecting=True)  # the estimator settles by that
 
     # -- what is known of it ----------------------------------------------------------------------------------------
-    def _measured_place(self, now: float) -> Vector | None:
-        """Return the position that motion capture measures (m, world); None if there is no fresh pose."""
-        return None if self.tracker is None else self.tracker.measured_position(now)
-
     def _why_misplaced(self) -> str:
         """Why its motors may not start: it does not know where it stands. Empty if it does."""
-        if self.tracker is None or self.last is None:
-            return ""
-        problem = self.tracker.why_estimate_wrong(self.last.position, time.monotonic())
-        return f"{self.name} {problem}" if problem else ""
+        problem = self.tracker.why_estimate_wrong(self.last.position, time.monotonic()) if self.last else ""
+        return problem and f"{self.name} {problem}"
 
     def log_age(self, now: float) -> float:
         """Seconds since the last log packet; infinite before the first one."""
@@ -226,21 +194,20 @@ class CrazyflieVehicle:
         return sum(now - t <= WINDOW_S for t, _ in sent) / WINDOW_S, quantile(latencies, 0.99)
 
     def watched_state(self, now: float) -> WatchedVehicle:
-        """What the safety rules need."""
         with self.lock:
             battery, last, wrong = self.robot.battery, self.last, self._watch.wrong
-            place = self._measured_place(now) if wrong else None if last is None else last.position
+            place = self.tracker.measured_position(now) if wrong else None if last is None else last.position
             streamed = (self._streaming or self._held) and self._command_time > -math.inf and not wrong
             return WatchedVehicle(
                 self.name, self.state, None if place is None else to_map(place, self.station.room_origin_in_world),
                 math.inf if last is None else last.battery, battery.flight_warning, battery.flight_landing,
                 self.log_age(now), self.command_age(now) if streamed else None,
-                None if self.tracker is None else self.tracker.age(now), wrong, now - self._watch.since,
+                self.tracker.age(now) if self.tracker.settings.enabled else None, wrong, now - self._watch.since,
             )  # fmt: skip
 
     # -- connection -------------------------------------------------------------------------------------------------
-    def connect(self, done: Callable[[], None]) -> None:
-        """Connect in a thread of its own; `done` is called when it has worked out or not."""
+    def connect(self, *, rejoin: bool = False) -> threading.Thread:
+        """Connect in a thread of its own; `rejoin`: its agent on board starts at once."""
         with self.lock:
             self.machine.enter(State.CONNECTING, f"connecting to {self.robot.uri}")
             self.guarded = self._overruled = self._paused = self._streaming = self._held = False
@@ -248,39 +215,47 @@ class CrazyflieVehicle:
             self._landings.clear()
 
         def run() -> None:
-            try:
-                reason = self.link.connect()
-                with self.lock:
-                    if reason:
-                        self._log("error", f"{self.name}: no connection: {reason}")
-                        self.machine.enter(State.DISCONNECTED, reason)
-                    else:
-                        self.machine.enter(State.READY, "connected")
-                        if self.last is not None:
-                            self.machine.update(self.last.info)
-            finally:
-                done()
+            reason = self.link.connect()
+            with self.lock:
+                if reason:
+                    self._log("error", f"{self.name}: no connection: {reason}")
+                    self.machine.enter(State.DISCONNECTED, reason)
+                else:
+                    self.machine.enter(State.READY, "connected")
+                    if self.last is not None:
+                        self.machine.update(self.last.info)
+            if rejoin and self.link.connected and self.link.board and (problem := self.link.start_agent()):
+                self._log("error", f"{self.name}: {problem}")
 
-        threading.Thread(target=run, name=f"{self.name}-connect", daemon=True).start()
+        thread = threading.Thread(target=run, name=f"{self.name}-connect", daemon=True)
+        thread.start()
+        return thread
 
     # -- orders -----------------------------------------------------------------------------------------------------
-    def command(self, setpoint: Setpoint) -> bool:
-        """Stream a command; False when it is not for the present state."""
+    def command(self, setpoint: Setpoint) -> str:
+        """Stream a command; why it is refused, if it leads out of the fence, is too fast, or not for the state."""
         with self.lock:
-            early = setpoint.stamp < self._guard_until
-            if self.state not in ACCEPTS_COMMANDS or self._overruled or self._paused or early:
+            fastest, outside = self.station.max_stream_mps, self._outside_fence(setpoint.place)
+            early, problem = setpoint.stamp < self._guard_until, ""
+            if setpoint.speed > fastest:
+                limit = f"(station.max_stream_mps is {fastest:g})"
+                problem = f"a command with {setpoint.speed:.2f} m/s is refused {limit}"
+            elif outside:
+                problem = f"a command to {outside} is refused"
+            elif self.state not in ACCEPTS_COMMANDS or self._overruled or self._paused or early:
+                problem = f"commands are not accepted now ({self.state.name.lower()}: {self.machine.reason})"
+            if problem:
                 self.refused += 1
-                return False
+                return problem
             if self._held:
-                self._log_info("commands again")
+                self._log("info", f"{self.name}: commands again")
             self._command_time = setpoint.stamp
             self._moved = self._streaming = True
             self._held, self._steady, self._order = False, None, None
             self.link.stream(setpoint)
-            return True
+            return ""
 
     def arm(self, arm: bool) -> str:
-        """Let the motors run, or lock them."""
         with self.lock:
             if self.state not in (State.READY, State.ARMED):
                 return f"{self.name} is {self.state_text}"
@@ -300,17 +275,17 @@ class CrazyflieVehicle:
         with self.lock:
             arms = self.state == State.READY and self.machine.arms_itself
             on_ground, last = arms or self.state == State.ARMED, self.last
-            if last is None or not (arms or self.state in WATCHED_OVER):
+            if last is None or not (arms or self.state in WATCHED):
                 return f"{self.name} is {self.state_text}, not armed"
             (x, y, z), critical = last.position, self.robot.battery.voltage_critical
-            problem = self._watch.wrong
-            if not problem and not math.isfinite(height):
-                problem = f"height {height} m is not finite"
-            if not problem and on_ground and last.battery < critical:
-                problem = f"battery {last.battery:.2f} V (voltage_critical is {critical:g} V)"
-            if not problem and (outside := self._outside_fence((x, y, height))):
-                problem = f"the take-off to {outside}"
-            problem = problem or too_short(duration, height - max(z, 0.0), self.station.max_speed_mps)
+            low, outside = on_ground and last.battery < critical, self._outside_fence((x, y, height))
+            problem = (
+                self._watch.wrong
+                or ("" if math.isfinite(height) else f"height {height} m is not finite")
+                or (f"battery {last.battery:.2f} V (voltage_critical is {critical:g} V)" if low else "")
+                or (f"the take-off to {outside}" if outside else "")
+                or too_short(duration, height - max(z, 0.0), self.station.max_speed_mps)
+            )
             if problem:
                 return f"{self.name}: {problem}"
             if on_ground and (problem := self._why_misplaced() or (self.arm(True) if arms else "")):
@@ -328,8 +303,9 @@ class CrazyflieVehicle:
                 self._fly(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
             return ""
 
-    def _outside_fence(self, place: Vector) -> str:
-        return outside_fence(place, self.station.safety, self.station.room_origin_in_world)
+    def _outside_fence(self, place: Vector | None) -> str:
+        station = self.station
+        return "" if place is None else outside_fence(place, station.safety, station.room_origin_in_world)
 
     def _why_not_steerable(self) -> str:
         """Why it takes no orders to fly somewhere; empty if it does."""
@@ -344,7 +320,7 @@ class CrazyflieVehicle:
                 return problem
             if on and (left := self._guard_until - time.monotonic()) > 0.0:
                 return f"{self.name} still flies its take-off or go_to, for {left:.1f} s"
-            self._log_info(f"the agent on board {'may steer' if on else 'may not steer any more'}")
+            self._log("info", f"{self.name}: the agent on board {'may steer' if on else 'may not steer any more'}")
             self.link.set_parameter(ENABLE, int(on))
             return ""
 
@@ -399,8 +375,8 @@ class CrazyflieVehicle:
         A landing is never refused for its numbers: one that would be too fast takes longer, and the log says so.
         """
         with self.lock:
-            height = height if math.isfinite(height) else 0.0
-            if self.state not in (*WATCHED_OVER, State.LOST):
+            height, self.longer = height if math.isfinite(height) else 0.0, ""
+            if self.state not in (*WATCHED, State.LOST):
                 return f"{self.name} is {self.state_text}"
             if self.state == State.ARMED and not self._moved:
                 return self.arm(False)  # a landing would start the motors
@@ -412,14 +388,15 @@ class CrazyflieVehicle:
             self._streaming |= self.state == State.LOST  # it must end a stream that the firmware may still follow
             self.machine.note_landing(self.action)
             if self._watch.wrong:
-                seen, self._held = self._measured_place(time.monotonic()), False
+                seen, self._held = self.tracker.measured_position(time.monotonic()), False
                 height_s = (self._trusted_height if seen is None else seen[2]) / SINK_MPS
                 self._fly_steadily((0.0, 0.0, -SINK_MPS), height_s + SINK_MORE_S, self._is_down, self._end_stream)
                 return ""
             way = self._height - height
             if 0.0 < duration < (seconds := landing_s(way, duration, self.station)):
                 why = too_short(duration, way, self.station.max_speed_mps)
-                self._log("warn", f"{self.name}: landing takes {seconds:.2f} s: {why}")
+                self.longer = f"{self.name}: landing takes {seconds:.2f} s: {why}"
+                self._log("warn", self.longer)
             self._brake_then(lambda: self._descend(height, duration))
             return ""
 
@@ -487,7 +464,6 @@ class CrazyflieVehicle:
         self._fly(LAND, lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
 
     def _brake_then(self, action: Callable[[], None]) -> None:
-        """Slow down, then do something."""
         if self.last is None or self.state not in IN_AIR:
             action()
         else:
@@ -502,7 +478,6 @@ class CrazyflieVehicle:
         self._go_on(now)
 
     def _go_on(self, now: float) -> None:
-        """Send the next packet of such a stream, if there is one."""
         if self._steady is None:
             return
         velocity, until, is_over, action = self._steady
@@ -516,7 +491,7 @@ class CrazyflieVehicle:
             self.link.stream(velocity_world(velocity, 0.0, now))
 
     def _is_down(self) -> bool:
-        seen = self._measured_place(time.monotonic())
+        seen = self.tracker.measured_position(time.monotonic())
         return seen is not None and seen[2] < DOWN_M
 
     def _end_stream(self) -> None:
@@ -542,12 +517,11 @@ class CrazyflieVehicle:
         :param feed: send the emergency stop watchdog, and blind landings that are due.
         """
         with self.lock:
-            if self._paused and self.tracker is not None:
-                self._paused = self.tracker.age(now) > self.station.safety.position_age_s
+            self._paused &= self.tracker.age(now) > self.station.safety.position_age_s
             self._go_on(now)
             if self.state not in OFF:
                 self.link.order_log(now)
-            if self.state in WATCHED_OVER and self._order is not None and (order := self._order.due(now)) is not None:
+            if self.state in WATCHED and self._order is not None and (order := self._order.due(now)) is not None:
                 self.link.order(order)
             if feed:
                 self._feed_watchdog(now)
@@ -558,7 +532,7 @@ class CrazyflieVehicle:
             self._streaming = True  # it must end a stream that the firmware may still follow
             self._descend(0.0, BLIND_LAND_S)
         # From the first arming on: once it has begun, the firmware locks itself when it ends.
-        self.guarded |= self.station.safety.emergency_watchdog and self.state in WATCHED_OVER
+        self.guarded |= self.station.safety.emergency_watchdog and self.state in WATCHED
         self.link.guarded = self.guarded
         if self.guarded and self.state not in (*OFF, State.EMERGENCY):
             self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +12,8 @@ from slot_helpers import one_slot
 
 from dtsa_agent.core import ConfigError, LocalProtocolError, Swarm, SwarmConfig
 from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.keys import VARIABLE, check_key, with_key
 
 KEY = bytes(range(32))
 RANDOM_KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
@@ -20,16 +22,6 @@ RANDOM_KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
 def test_golden_tag() -> None:
     """Ties the tag to its definition: BLAKE2s with key and person, over session, slot and frame."""
     assert Authenticator(KEY, 5).seal(b"frame", 7).hex() == "6672616d6500ba891a"
-
-
-@pytest.mark.parametrize("change", [
-    lambda frame: bytes([frame[0] ^ 1]) + frame[1:], lambda frame: frame[:-1] + bytes([frame[-1] ^ 0x80]),
-    lambda frame: frame[:-1], lambda frame: frame + b"\0", lambda frame: frame[:4], lambda frame: b"",
-])  # fmt: skip
-def test_changed_frames(change: Callable[[bytes], bytes]) -> None:
-    auth = Authenticator(KEY)
-    assert auth.open(change(auth.seal(b"position and so on", 12)), 12) is None
-    assert auth.rejected == 1
 
 
 def test_replays_and_foreign_frames() -> None:
@@ -93,3 +85,54 @@ def test_damaged_frames(policy: str, pick: int, changes: list[tuple[int, int]], 
 def test_frames_that_do_not_fit(length: int) -> None:
     with pytest.raises(LocalProtocolError, match="cannot be sealed"):
         Authenticator(KEY).seal(bytes(length), 1)
+
+
+@pytest.fixture
+def key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, RANDOM_KEY)
+
+
+def swarm_with_key(**settings: Any) -> Swarm:
+    return with_key(make_swarm(SwarmConfig(agents=6, auth=True, **settings)))
+
+
+@pytest.mark.parametrize("policy", ["tdma", "dtsa", "lease"])
+@pytest.mark.usefixtures("key")
+def test_forged_replayed_cut_and_foreign_frames_are_rejected_and_counted(policy: str) -> None:
+    agents, stranger = swarm_with_key(policy=policy), Swarm(SwarmConfig(agents=6, policy=policy))
+    other_session = swarm_with_key(policy=policy, auth_session=7)
+    swarms = agents, stranger, other_session
+    early, *_, unsealed, elsewhere = [next(iter(one_slot(s, slot).values())) for slot in range(20) for s in swarms]
+    before = agents.sent_position.copy(), agents.sent_slot.copy()
+    assert agents.authenticator is not None
+    good = agents.authenticator.seal(unsealed, 20)
+    changed = bytes([good[0] ^ 1]) + good[1:], good[:-1] + bytes([good[-1] ^ 0x80])
+    for data in (early, unsealed, elsewhere, *changed, good[:-1], good[:4], good + b"\0", b"", b"abc", bytes(60)):
+        assert not agents.hear(20, data)
+    assert agents.rejected == 11
+    assert agents.malformed == agents.foreign == 0
+    assert np.array_equal(before[0], agents.sent_position)
+    assert np.array_equal(before[1], agents.sent_slot)
+
+
+@pytest.mark.parametrize("text", ["", "xyz", "0011", "00" * 16])
+@pytest.mark.usefixtures("key")
+def test_a_missing_or_bad_key_is_said_without_showing_it(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    check_key(SwarmConfig(auth=True))
+    monkeypatch.setenv(VARIABLE, text)
+    check_key(SwarmConfig())
+    for look in (swarm_with_key, lambda: check_key(SwarmConfig(auth=True))):
+        with pytest.raises(ConfigError) as caught:
+            look()
+        assert not text or text not in str(caught.value)
+
+
+@pytest.mark.usefixtures("key")
+def test_a_session_can_begin_when_the_flight_does() -> None:
+    sealed, other = swarm_with_key(policy="tdma"), swarm_with_key(policy="tdma")
+    first = one_slot(sealed, 0)[1]
+    other.begin_session(7)
+    assert one_slot(other, 0)[1][:-4] == first[:-4]
+    before = other.rejected
+    assert not other.hear(0, first)
+    assert other.rejected == before + 1

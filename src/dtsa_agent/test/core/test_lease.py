@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lease_helpers import FAR, STATEMENTS, Air, is_anchor, make, still
 
-from dtsa_agent.core import ConfigError, Scenario, Swarm, SwarmConfig, make_scenario
+from dtsa_agent.core import REASONS, ConfigError, Scenario, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import OPEN, ExtendedFrame, Frame, Gossip, decode_extended, encode_extended
 from dtsa_agent.core.reference.lease.events import uses_open_turn
 from dtsa_agent.core.reference.lease.issue import open_block
@@ -230,7 +230,7 @@ def test_open_turns_are_spaced_evenly() -> None:
     """So who wakes waits for one block at most, the odd one that is nobody's apart."""
     air = Air(make(40, 10, open_every=20)).run(3000)
     block = open_block(40, 20, 30, 30)
-    opened = [slot for slot in range(3000, 3600) if air.run(1).swarm.reason_name(0) == "open"]
+    opened = [slot for slot in range(3000, 3600) if REASONS[air.run(1).swarm.reason[0]] == "open"]
     assert len(opened) >= 0.9 * 600 / block
     assert max(np.diff(opened)) < 2 * block
 

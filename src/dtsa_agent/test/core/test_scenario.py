@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.kernel import lib, memory
 from dtsa_agent.core.settings.scenario import Course, Plan, half_axes
 
 
@@ -181,9 +182,13 @@ def plan(legs: int, begin: int = 0, pause: int = 0) -> Plan:
     return Plan(np.zeros((3, 1)), goals, np.array([begin]), np.array([pause]), np.array([True]), 0.3)
 
 
+def advance(course: Course, slot: int, position: np.ndarray) -> bool:
+    return bool(lib.course_advance(course.kernel, slot, memory(np.ascontiguousarray(position))))
+
+
 def test_an_agent_rests_at_its_goals_and_then_goes_on() -> None:
     course = Course(plan(3, begin=5, pause=4), np.array([0], dtype=np.int32))
-    legs, finals = [], []
+    legs = []
     for slot in range(30):
         # It needs three slots to a goal, and is pushed out of it for one slot while it rests.
         leg = int(course.leg[0])
@@ -191,13 +196,10 @@ def test_an_agent_rests_at_its_goals_and_then_goes_on() -> None:
         x = (leg + 1.0 if there else leg + 0.5) if leg >= 0 else 0.0
         if there and slot - int(course.changed[0]) == 5:
             x += 0.4
-        changed = course.advance(slot, np.array([[x], [0.0], [0.0]]))
+        changed = advance(course, slot, np.array([[x], [0.0], [0.0]]))
         assert changed == (course.changed[0] == slot)
         legs.append(int(course.leg[0]))
-        finals.append(bool(course.final[0]))
-        assert bool(course.active[0]) == (slot >= 5)
     assert legs == [-1] * 5 + [0] * 7 + [1] * 7 + [2] * 11
-    assert finals == [leg == 2 for leg in legs]
 
 
 def test_each_agent_alone_computes_what_all_together_compute() -> None:
@@ -210,12 +212,12 @@ def test_each_agent_alone_computes_what_all_together_compute() -> None:
     for slot in range(200):
         near = random.random(6) < 0.1
         position = np.where(near, together.goal, together.goal + 5.0)
-        together.advance(slot, position)
+        advance(together, slot, position)
         for k, course in enumerate(alone):
             assert course is not None
-            course.advance(slot, position[:, [k]])
+            advance(course, slot, position[:, [k]])
             assert np.array_equal(course.goal[:, 0], together.goal[:, k])
-    assert together.final.all()
+    assert (together.leg == len(made.plan.goals) - 1).all()
 
 
 def test_the_swarm_gets_goals_activity_and_what_all_know() -> None:

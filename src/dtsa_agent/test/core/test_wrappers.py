@@ -12,7 +12,7 @@ from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
 from dtsa_agent.core.plugins.entry_points import PluginSwarm
 from dtsa_agent.core.settings.flight_models import VehicleParams
-from dtsa_agent.crazyflie.node.agents_node import HOLD_GAIN, HOLD_MPS, ExternalVehicles
+from dtsa_agent.crazyflie.node.agents_node import HOLD_GAIN, HOLD_MPS, steer, ways_apart
 
 KEY = bytes(range(16))
 DECIDED, FLOWN = ("chosen", "reason", "digest", "score"), ("position", "velocity", "command", "track")
@@ -46,9 +46,7 @@ def test_other_swarms_fly_like_the_plain_one(policy: str, make: Callable[[SwarmC
 
 def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothing_moves() -> None:
     config = SwarmConfig(agents=4, moving=2, policy="tdma", seed=2)
-    sent: list[np.ndarray] = []
     plain, outside = Swarm(config), Swarm(config)
-    vehicles = ExternalVehicles([outside], 2, lambda _, command: sent.append(command.copy()))
     for swarm in (plain, outside):
         swarm.scenario.advance(0, swarm)
     still = plain.active == 0
@@ -56,17 +54,15 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
         for swarm in (plain, outside):
             swarm.position[:, still] = plain.scenario.start[:, still] + 0.1
             swarm.begin(slot)
-        vehicles.set_positions(plain.position)
+        outside.position[:] = outside.track[:] = plain.position
         outside.velocity[:] = plain.velocity
         before = outside.position.copy()
         plain.steer(slot, 0)
-        vehicles.send_commands(slot)
+        steer(outside, slot)
         assert np.array_equal(outside.position, before)
         assert np.array_equal(outside.track[-1], before)
-        assert len(sent) == slot // 2 + 1
-        if slot % 2 == 0:
-            assert np.array_equal(sent[-1][:, ~still], plain.command[:, ~still])
-            assert sent[-1][:, still] == pytest.approx(max(-HOLD_GAIN * 0.1, -HOLD_MPS))
+        assert np.array_equal(outside.command[:, ~still], plain.command[:, ~still])
+        assert outside.command[:, still] == pytest.approx(max(-HOLD_GAIN * 0.1, -HOLD_MPS))
         for swarm in (plain, outside):
             for index in np.flatnonzero(swarm.sends):
                 swarm.hear(slot, swarm.frame(index))
@@ -76,16 +72,16 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
 
 def test_no_command_leads_out_of_the_fence() -> None:
     """Making way for others led one of twelve out, and the bridge landed all."""
-    config, sent = SwarmConfig(agents=2, moving=2, policy="tdma", seed=2), list[np.ndarray]()
-    for fence in (None, ((-0.5, -9.0, -9.0), (0.5, 9.0, 9.0))):
+    config, commands = SwarmConfig(agents=2, moving=2, policy="tdma", seed=2), list[np.ndarray]()
+    for fence in (None, np.array([(-0.5, -9.0, -9.0), (0.5, 9.0, 9.0)])[:, :, None]):
         swarm = Swarm(config)
         swarm.scenario.advance(0, swarm)
-        vehicles = ExternalVehicles([swarm], 1, lambda _, command: sent.append(command.copy()), fence)
-        vehicles.set_positions(np.array([[0.45, -0.6], [0.0, 0.0], [0.0, 0.0]]))
+        swarm.position[:] = swarm.track[:] = [[0.45, -0.6], [0.0, 0.0], [0.0, 0.0]]
         swarm.goal[:] = [[3.0, -3.0], [0.0, 0.0], [0.0, 0.0]]
         swarm.begin(0)
-        vehicles.send_commands(0)
-    free, fenced = sent
+        steer(swarm, 0, fence)
+        commands.append(swarm.command.copy())
+    free, fenced = commands
     assert free[0, 0] > 0.5 > 0.1 > fenced[0, 0] > 0.0  # slower, the nearer the fence
     assert free[0, 1] < -0.5 < 0.1 < fenced[0, 1]  # outside: back
 
@@ -101,19 +97,17 @@ def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple
     )  # fmt: skip
     commands = np.zeros((3, 12))
     swarm = Swarm(config)
-    vehicles = ExternalVehicles([swarm], 1, lambda _, c: np.copyto(commands, c))
     swarm.scenario.advance(0, swarm)
     place, velocity, closest = swarm.scenario.start.copy(), np.zeros((3, 12)), np.inf
     for now in range(slot + 200):
-        vehicles.set_positions(place)
+        swarm.position[:] = swarm.track[:] = place
         swarm.velocity[:] = velocity
-        if now == slot and stop_here:
-            vehicles.stop_here()
         swarm.begin(now)
         for index in np.flatnonzero(swarm.sends):
             swarm.hear(now, swarm.frame(index))
         if now < slot or stop_here:
-            vehicles.send_commands(now)
+            steer(swarm, now, way=ways_apart(swarm.position) if now >= slot else None)
+            commands[:] = swarm.command
         elif now >= slot + 20:
             commands[:] = 0.0
         swarm.end(now)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -51,7 +53,7 @@ def test_what_is_too_short_is_refused_and_motors_never_stop_between_a_stream_and
 
             def stream() -> None:
                 for _ in range(10):
-                    assert cf.command(velocity_world((0.1, 0.0, 0.0), 0.0, time.monotonic()))
+                    assert cf.command(velocity_world((0.1, 0.0, 0.0), 0.0, time.monotonic())) == ""
                     time.sleep(0.05)
 
             def reaches(height: float) -> None:
@@ -99,3 +101,29 @@ def test_what_is_too_short_is_refused_and_motors_never_stop_between_a_stream_and
         ended = [k for k, name in enumerate(names) if name == "stream ended"]
         assert len(ended) >= 2
         assert {names[k - 1] for k in ended} <= {"go_to", "land"}
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_a_setpoint_passes_seven_files_from_its_topic_to_cflib(tmp_path: Path) -> None:
+    pytest.importorskip("cflib")
+    messages = pytest.importorskip("dtsa_msgs.msg")
+    from bridge_helpers import fake_fleet, flight, settings
+
+    from dtsa_agent.crazyflie.commands import POSITION
+    from dtsa_agent.crazyflie.node.topics import BridgeInputs
+    from dtsa_agent.crazyflie.state import State
+
+    with fake_fleet(tmp_path, 1) as fleet, flight(settings(fleet)) as pilot:
+        assert pilot.bridge.connect() == []
+        cf = pilot.bridge.vehicles["cf1"]
+        cf.arm(True)
+        wait_for(lambda: cf.state is State.ARMED)
+        message, crossed = messages.Position(z=-0.5), set[str]()
+        message.header.frame_id = "map"
+        sys.setprofile(lambda frame, event, argument: crossed.add(frame.f_code.co_filename))
+        BridgeInputs._stream(SimpleNamespace(), POSITION, cf, message, time.time())  # type: ignore[arg-type]
+        sys.setprofile(None)
+        wait_for(lambda: fleet.events(name="streaming"))
+    ours = {Path(file).stem for file in crossed if "/dtsa_agent/dtsa_agent/" in file}
+    assert ours == {"topics", "commands", "state", "vehicle", "safety", "link", "drivers"}

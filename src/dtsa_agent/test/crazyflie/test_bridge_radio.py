@@ -77,11 +77,11 @@ def test_without_its_dongle_a_link_says_so_and_does_not_connect_for_ever(tmp_pat
     with radio_flight(tmp_path, 1, {}) as (fleet, pilot):
         fleet.fault("unplug", 1, dongle=0)
         wait_for(lambda: pilot.state(1) == State.LOST, 5.0)
-        pilot.bridge.vehicles["cf1"].connect(lambda: None)
+        pilot.bridge.vehicles["cf1"].connect()
         wait_for(lambda: pilot.state(1) == State.DISCONNECTED, 20.0)
         fleet.fault("heal", 1)
         wait_for(lambda: any("is there again" in line for _, _, line in pilot.lines), 5.0)
-        pilot.bridge.vehicles["cf1"].connect(lambda: None)
+        pilot.bridge.vehicles["cf1"].connect()
         wait_for(lambda: pilot.state(1) == State.READY, 20.0)
 
 

@@ -14,7 +14,7 @@ import pytest
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.addresses import Address, check_budget, parse_address, radio_loads
-from dtsa_agent.crazyflie.bridge import Ownership
+from dtsa_agent.crazyflie.bridge import own_addresses
 from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.crazyflie.settings import load_swarm, parse_swarm
 
@@ -215,7 +215,7 @@ def test_budget_is_what_one_radio_is_known_to_carry(rate: float, most: int, bits
 def test_budget_counts_each_radio_and_no_udp() -> None:
     wired = [(parse_address("udp://127.0.0.1:19850"), 100.0)]
     loads = radio_loads(robots(4, 50) + robots(3, 50, "1", channel=100) + wired)
-    assert [(load.medium, load.count) for load in loads] == [("radio 0", 4), ("radio 1", 3)]
+    assert [(load.medium, load.number) for load in loads] == [("radio 0", 4), ("radio 1", 3)]
     assert all(load.fits for load in loads)
 
 
@@ -237,16 +237,16 @@ def test_the_budget_says_with_which_rates_it_would_fit() -> None:
 
 def test_a_crazyflie_belongs_to_one_bridge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    first = Ownership([("cf1", "radio://0/80/2M/E7E7E7E701"), ("cf2", "radio://0/80/2M/E7E7E7E702")])
+    first = own_addresses([("cf1", "radio://0/80/2M/E7E7E7E701"), ("cf2", "radio://0/80/2M/E7E7E7E702")])
     with pytest.raises(ConfigError, match="no other bridge") as error:
-        Ownership([("cf9", "radio://0/80/2M/E7E7E7E709"), ("a2", "radio://0/80/2M/e7e7e7e702?rate_limit=50")])
+        own_addresses([("cf9", "radio://0/80/2M/E7E7E7E709"), ("a2", "radio://0/80/2M/e7e7e7e702?rate_limit=50")])
     assert error.value.field == "robots.a2.uri"
-    Ownership([("cf9", "radio://0/80/2M/E7E7E7E709")]).release()  # what it had taken before it was refused is free
+    own_addresses([("cf9", "radio://0/80/2M/E7E7E7E709")]).close()  # what it had taken before it was refused is free
     monkeypatch.setenv(SIMULATED_RADIO, str(tmp_path / "radio"))
-    Ownership([("cf2", "radio://0/80/2M/E7E7E7E702")]).release()  # on another air
+    own_addresses([("cf2", "radio://0/80/2M/E7E7E7E702")]).close()  # on another air
     monkeypatch.delenv(SIMULATED_RADIO)
-    first.release()
-    Ownership([("cf2", "radio://0/80/2M/E7E7E7E702")]).release()
+    first.close()
+    own_addresses([("cf2", "radio://0/80/2M/E7E7E7E702")]).close()
 
 
 def test_cflib_shows_no_warnings_of_other_packages() -> None:

@@ -18,18 +18,17 @@ import yaml
 from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.positions import POSES_AFTER_JUMP, PoseTracker, PositionSettings, SettlingCheck, quantile
+from dtsa_agent.crazyflie.positions import POSES_AFTER_JUMP, PoseTracker, PositionSettings, quantile
 from dtsa_agent.crazyflie.safety import EstimateWatch, SafetySettings
 from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_agent.crazyflie.state import VehicleState
 
-ROOM = ((-1.5, -2.3, -0.95), (1.5, 2.3, 0.95))
 ORIGIN = (0.0, 0.0, 0.95)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 def tracker(**changes: Any) -> PoseTracker:
-    return PoseTracker(PositionSettings(source="pose", **changes), ORIGIN, ROOM)
+    return PoseTracker(PositionSettings(**({"source": "pose"} | changes)), SafetySettings(), ORIGIN)
 
 
 def offer(t: PoseTracker, place: Any, at: float, *, q: Any = LEVEL, frame: str = "world", flying: bool = False) -> str:
@@ -39,7 +38,7 @@ def offer(t: PoseTracker, place: Any, at: float, *, q: Any = LEVEL, frame: str =
 @pytest.mark.parametrize(("pose", "kind", "words"), [
     ({"place": (math.nan, 0.0, 0.0)}, "not finite", "not finite"),
     ({"place": (0.0, 0.0, math.inf)}, "not finite", "not finite"),
-    ({"place": (5.0, 0.0, 0.0)}, "outside", "3.50 m outside the room in x"),
+    ({"place": (5.0, 0.0, 0.0)}, "outside", "3.50 m outside the geofence in x"),
     ({"q": (0.0, 0.0, 0.0, 0.0)}, "quaternion", "length 0, not 1"),
     ({"frame": "odom"}, "frame", "'odom' is neither world nor map"), ({"at": 0.99}, "stamp", "0.010 s before"),
     ({"at": 1.0}, "stamp", "0.000 s before"), ({"place": (1.0, 0.0, 0.0)}, "jump", "jumps by 1.00 m"),
@@ -169,16 +168,17 @@ def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None
     ((0.0, 0.0, 0.0), 1e-5, None, ""),
 ])  # fmt: skip
 def test_settled_is_where_it_stands(place: Any, variance: float, seen: Any, words: str) -> None:
-    settling = SettlingCheck(0.01, ORIGIN, ROOM, None if seen is None else 0.1)
-    for _ in range(10):
-        problem = settling.find_problem(place, variance, None if seen == "not" else seen)
+    t = tracker(source="none" if seen is None else "pose")
+    if isinstance(seen, tuple):
+        assert offer(t, seen, 1.0) == ""
+    problem = t.why_not_settled([place] * 10, variance, 0.01, 1.0)
     assert (problem == "") is (words == "")
     assert words in problem
 
 
 def test_an_estimate_that_wanders_has_not_settled() -> None:
-    settling = SettlingCheck(0.01, ORIGIN, ROOM, None)
-    assert all("its place moves by" in settling.find_problem((0.03 * k, 0.0, 0.0), 1e-5, None) for k in range(20))
+    places = [(0.03 * k, 0.0, 0.0) for k in range(20)]
+    assert "its place moves by" in tracker(source="none").why_not_settled(places, 1e-5, 0.01, 1.0)
 
 
 def flown(
@@ -206,7 +206,7 @@ def test_jumps_standstill_and_errors_in_flight_are_noticed() -> None:
 
 def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rclpy")
-    from dtsa_agent.crazyflie.node.topics import _receive_named, named_pose_array
+    from dtsa_agent.crazyflie.node.topics import subscribe_positions
 
     assert PositionSettings(source="pose").topic_of("cf3") == "/cf3/pose"
     assert PositionSettings(source="named_poses").topic_of("cf3") == "/poses"
@@ -214,17 +214,21 @@ def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.Monkey
     with pytest.raises(ConfigError) as error:
         parse_swarm({"robots": {"cf1": {"uri": "udp://h:1"}}, "station": {"positions": {"source": "vicon"}}})
     assert error.value.field == "station.positions.source"
+    named, got, callbacks = PositionSettings(source="named_poses"), list[Any](), list[Any]()
+    vehicles: Any = {"cf2": SimpleNamespace(receive_pose=lambda *pose: got.append(pose))}
+    thread: Any = SimpleNamespace(subscribe=lambda kind, topic, callback, qos: callbacks.append(callback))
     monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces", None)
     with pytest.raises(ConfigError, match="motion_capture_tracking_interfaces in the workspace"):
-        named_pose_array()
+        subscribe_positions(thread, named, vehicles)
     # By name; bodies that are no Crazyflies are of no concern.
-    got: list[Any] = []
+    monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces", SimpleNamespace())  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces.msg", SimpleNamespace(NamedPoseArray=None))  # type: ignore[arg-type]
+    subscribe_positions(thread, named, vehicles)
     stamp = SimpleNamespace(sec=5, nanosec=500_000_000)
     position, orientation = SimpleNamespace(x=1.0, y=2.0, z=3.0), SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
     pose = SimpleNamespace(position=position, orientation=orientation)
     poses = [SimpleNamespace(name=name, pose=pose) for name in ("wand", "cf2")]
-    message = SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id="world"), poses=poses)
-    _receive_named({"cf2": SimpleNamespace(receive_pose=lambda *pose: got.append(pose))}, message, 0.0)  # type: ignore[dict-item]
+    callbacks[0](SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id="world"), poses=poses), 0.0)
     assert got == [((1.0, 2.0, 3.0), LEVEL, "world", 5.5)]
 
 

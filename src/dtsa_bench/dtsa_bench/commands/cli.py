@@ -50,11 +50,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def build_parser(command: str | None, others: Sequence[str] = ()) -> tuple[CommandParser, Command | None]:
-    """Parser of the whole command line; only the chosen command's module is imported.
-
-    :param command: first word of the command line, None if there is none.
-    :returns: the parser, and the chosen command or None.
-    """
+    """Parser of the whole command line, and the command that its first word names; only its module is imported."""
     parser = CommandParser(prog=PROGRAM, description="Channel access in quadcopter swarms.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     subparsers = parser.add_subparsers(
@@ -78,10 +74,7 @@ def add_command(command: Command, parser: CommandParser, name: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    :param arguments: command line without the program's name; None: this process's.
-    """
+    """Run one command; ``arguments``: the command line without the program's name, None: this process's."""
     try:
         try:
             return _run(list(sys.argv[1:] if arguments is None else arguments))
@@ -141,7 +134,6 @@ options that have names. It asks nobody while one types; after an update it is m
         ("bash > ~/.dtsa-completion.bash", "then, in ~/.bashrc: . ~/.dtsa-completion.bash"),
         ("zsh > ~/.zsh/_dtsa", "then, in ~/.zshrc before compinit: fpath=(~/.zsh $fpath)"),
     )
-
     options = (("shell", "for which shell", {"choices": ("bash", "zsh")}),)
 
     def run(self, args: argparse.Namespace) -> int:

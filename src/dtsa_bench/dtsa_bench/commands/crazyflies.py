@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .registry import Command, add_rows
+from .registry import Command, Row, add_rows
 
 if TYPE_CHECKING:
     from dtsa_agent.core import SwarmConfig
@@ -21,6 +21,11 @@ FILE, ALL = "file", "all"  # of bridge --check
 PROTOCOL = "protocol"  # app of peer-lab, and its settings
 _OF_PROTOCOL = ("policy", "slot_ms", "moving", "auth_session")
 _SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "radius_m", "channel", "rate")
+#: Option that puts simulated Crazyradios in the place of real ones.
+SIMULATED_RADIO: Row = (
+    "--simulated-radio SOCKET",
+    "simulation only: radio:// goes to the Crazyradios of `fake-crazyflie --simulated-radio SOCKET`", {"type": Path},
+)  # fmt: skip
 
 
 class BridgeCommand(Command):
@@ -32,20 +37,16 @@ The first Ctrl-C lands all, the second stops all motors."""
         ("--places 10 > swarm.yaml", "a file to begin with: where ten begin, and rates for one dongle"),
         ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
     )
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        add_rows(parser, (
-            ("--config CONFIG", "swarm.yaml: robots, types, defaults, station", {"type": Path}),
-            ("--places N", "print a swarm.yaml for a mission of N on one dongle: places and rates; and end"),
-            ("--backend", "cflib: the Crazyflies of the file; sim: simulated ones in their place (default %(default)s)",
-             {"choices": ("cflib", "sim"), "default": "cflib"}),
-        ))  # fmt: skip
-        add_simulated_radio(parser)
-        add_rows(parser, (
-            ("--check", "connect, list what a flight needs (links, firmware, batteries, positions, clocks, geofence, "
-             "budget, priority), and end; exit code 1 if something is missing. file: the file and the budget alone",
-             {"nargs": "?", "const": ALL, "choices": (FILE, ALL)}),
-        ))  # fmt: skip
+    options = (
+        ("--config CONFIG", "swarm.yaml: robots, types, defaults, station", {"type": Path}),
+        ("--places N", "print a swarm.yaml for a mission of N on one dongle: places and rates; and end"),
+        ("--backend", "cflib: the Crazyflies of the file; sim: simulated ones in their place (default %(default)s)",
+         {"choices": ("cflib", "sim"), "default": "cflib"}),
+        SIMULATED_RADIO,
+        ("--check", "connect, list what a flight needs (links, firmware, batteries, positions, clocks, geofence, "
+         "budget, priority), and end; exit code 1 if something is missing. file: the file and the budget alone",
+         {"nargs": "?", "const": ALL, "choices": (FILE, ALL)}),
+    )  # fmt: skip
 
     def run(self, args: argparse.Namespace) -> int:
         """Run the bridge until Ctrl-C."""
@@ -76,12 +77,6 @@ The first Ctrl-C lands all, the second stops all motors."""
             return run_bridge(config, check=args.check == ALL)
 
 
-def add_simulated_radio(parser: argparse._ActionsContainer) -> None:
-    """Add the option that puts simulated Crazyradios in the place of real ones."""
-    text = "simulation only: radio:// goes to the Crazyradios of `fake-crazyflie --simulated-radio SOCKET`"
-    parser.add_argument("--simulated-radio", type=Path, metavar="SOCKET", help=text)
-
-
 def use_simulated_radio(args: argparse.Namespace) -> None:
     """Tell this process and those that it starts."""
     from dtsa_agent.crazyflie.link import SIMULATED_RADIO
@@ -98,7 +93,7 @@ def run_bridge(config: Path, *, check: bool = False) -> int:
     if check:
         # Too many for a radio is a line of the list here, not the end.
         arguments += ["--log-level", "error"]
-        return bridge_node.main(arguments, lambda node: bridge_node.check_node(node, print))
+        return bridge_node.main(arguments, bridge_node.check_bridge)
     return bridge_node.main(arguments)
 
 
@@ -186,6 +181,7 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
     def run(self, args: argparse.Namespace) -> int:
         """Fly and print what came of it."""
         from dtsa_agent.core.errors import ConfigError
+        from dtsa_agent.core.settings.declaration import parse_values
         from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
         from dtsa_bench.crazyflies.peer_lab.process import fly
         from dtsa_bench.runs.options import given_options, new_directory
@@ -193,7 +189,10 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
         if not 0.0 < args.seconds <= 1e6:
             raise ConfigError("seconds", args.seconds, "more than 0, up to 1000000")
         settings = LabSettings(**given_options(args, LabSettings, "lab"))
-        parameters = dict(map(_parameter, args.set))
+        try:
+            parameters = parse_values(",".join(args.set))
+        except ValueError:
+            raise ConfigError("set", ", ".join(args.set), "GROUP.NAME=NUMBER") from None
         out = None if args.out is None else new_directory(args.out)
         swarm, place = None, args.app
         of_protocol = {name: getattr(args, name) for name in _OF_PROTOCOL if getattr(args, name) is not None}
@@ -231,16 +230,6 @@ def _swarm(options: dict[str, str], settings: Any) -> SwarmConfig:
     check_onboard_swarm(swarm)
     key_of(swarm)
     return swarm
-
-
-def _parameter(text: str) -> tuple[str, float]:
-    from dtsa_agent.core.errors import ConfigError
-
-    name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise ConfigError("set", text, "GROUP.NAME=NUMBER") from None
 
 
 def _lines(summary: dict[str, Any], printed: int) -> str:

@@ -35,7 +35,6 @@ every machine, stand side by side on a page; in the last one, in real time, a pr
         ("", "everything, into runs/demo-1, and the page in a browser"),
         ("--animation --no-open --out story", "with a moving picture; no browser"),
     )
-
     options = (
         ("--out DIR", "new directory for everything [runs/demo-1, -2, ...]"),
         ("--seed N", "seed of the flights [1]", {"default": "1"}),

@@ -26,7 +26,7 @@ from dtsa_bench.runs.options import (
     whole_number,
 )  # fmt: skip
 
-from .crazyflies import add_simulated_radio, use_simulated_radio
+from .crazyflies import SIMULATED_RADIO, use_simulated_radio
 from .registry import INTERRUPTED, Command, add_rows, warn
 
 if TYPE_CHECKING:
@@ -35,6 +35,14 @@ if TYPE_CHECKING:
 
 LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
 _LATER = ("respawn",)  # options of a flight that concern real time alone
+_CRAZYFLIE_OPTIONS = (
+    ("--backend", "cflib: the Crazyflies of --config, in real time [sim]",
+     {"choices": ("sim", "cflib"), "default": "sim"}),
+    ("--config FILE", "swarm.yaml of the Crazyflies, for --backend cflib"),
+    SIMULATED_RADIO,
+    ("--attach", "by the bridge that runs already (dtsa bridge) on the ROS domain of --domain or ROS_DOMAIN_ID, "
+     "and goes on: for several missions in a row"),
+)  # fmt: skip
 
 
 class FlyCommand(Command):
@@ -63,7 +71,7 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
             ("--control", "the page may kill and start agents and change the channel; land and stop Crazyflies"),
         ))  # fmt: skip
         add_options(group, FlightOptions, "flight", skip=(*_LATER, "startup_s", "processes", "domain", "pictures"))
-        _add_crazyflie_options(parser)
+        add_rows(parser.add_argument_group("Crazyflies"), _CRAZYFLIE_OPTIONS)
         add_run_options(parser)
         clocks = add_mode_options(parser)
         kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
@@ -124,20 +132,6 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
         return 1 if _report_missing_frames(flight.summary) or cut_short else 0
 
 
-def _add_crazyflie_options(parser: argparse.ArgumentParser) -> None:
-    crazyflies = parser.add_argument_group("Crazyflies")
-    add_rows(crazyflies, (
-        ("--backend", "cflib: the Crazyflies of --config, in real time [sim]",
-         {"choices": ("sim", "cflib"), "default": "sim"}),
-        ("--config FILE", "swarm.yaml of the Crazyflies, for --backend cflib"),
-    ))  # fmt: skip
-    add_simulated_radio(crazyflies)
-    add_rows(crazyflies, (
-        ("--attach", "by the bridge that runs already (dtsa bridge) on the ROS domain of --domain or ROS_DOMAIN_ID, "
-         "and goes on: for several missions in a row"),
-    ))  # fmt: skip
-
-
 def page_options(args: argparse.Namespace) -> PageOptions | None:
     """The page that is wanted; None: none is."""
     if not (args.view or args.view_port or args.control):
@@ -149,13 +143,11 @@ def page_options(args: argparse.Namespace) -> PageOptions | None:
 
 def late_agents(text: str | None) -> dict[int, float]:
     """Seconds by agent, from ``cf5=3,cf6=4.5``."""
-    late = {}
-    for part in () if text is None else text.split(","):
-        match = re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part)
-        if not match:
-            raise ConfigError("late", text, "cfK=S,...: agents, and seconds after slot 0")
-        late[int(match[1])] = float(match[2])
-    return late
+    parts = [] if text is None else text.split(",")
+    matches = [re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part) for part in parts]
+    if not all(matches):
+        raise ConfigError("late", text, "cfK=S,...: agents, and seconds after slot 0")
+    return {int(match[1]): float(match[2]) for match in matches if match}
 
 
 def run_crazyflies(args: argparse.Namespace) -> int:
@@ -192,11 +184,9 @@ def run_crazyflies(args: argparse.Namespace) -> int:
 
 def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
     """What went wrong in a mission; empty: nothing. ``cut_short``: why the exchange was, if it was."""
-    if not (cut_short or not_landed):
-        return ""
     exchange = f"the exchange was cut short: {cut_short}" if cut_short else "the exchange is complete"
     end = f"not known to have landed: {', '.join(not_landed)}" if not_landed else "all have landed"
-    return f"{exchange}; {end}"
+    return f"{exchange}; {end}" if cut_short or not_landed else ""
 
 
 def _report_missing_frames(summary: dict[str, Any]) -> bool:
@@ -208,11 +198,8 @@ def _report_missing_frames(summary: dict[str, Any]) -> bool:
 
 def _print_result(args: argparse.Namespace, flight: Any) -> None:
     """Print what came of a flight."""
-    if args.json:
-        print(json.dumps(flight.summary, indent=2))
-        return
-    print(describe(flight.summary))
-    print(f"bag:     {flight.bag}\nresults: {Path(args.out) / 'summary.json'}")
+    files = f"bag:     {flight.bag}\nresults: {Path(args.out) / 'summary.json'}"
+    print(json.dumps(flight.summary, indent=2) if args.json else f"{describe(flight.summary)}\n{files}")
 
 
 def describe(summary: dict[str, Any]) -> str:

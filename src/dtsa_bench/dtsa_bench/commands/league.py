@@ -168,7 +168,6 @@ Writes a package with a policy of your own that works: the policy, a test, a swe
 best and the bound, and the lines that install and run it. What a policy is given and what it
 returns: docs/reference/plug-ins.md."""
     examples = (("my-policy --out plugins/my-policy", "then as its README.md says"),)
-
     options = (
         ("name NAME", "what the policy will be called, as in my-policy"),
         ("--out DIR", "where the package goes (default: a directory of that name here)"),

@@ -77,10 +77,9 @@ def _read_file(args: argparse.Namespace) -> None:
     """Settings of the file stand for options that were not given; an error names both."""
     path = args.swarm_file
     values = {} if path is None else _content(path)
-    air = values.pop("air", AIRS[0])
-    args.air = args.air or Setting("air", "text", None, "what carries the frames", words=AIRS).check(
-        air, f"air in {path}"
-    )
+    carriers = Setting("air", "text", None, "what carries the frames", words=AIRS)
+    args.air = args.air or carriers.check(values.pop("air", AIRS[0]), f"air in {path}")
+    values.pop("air", None)
     sections: dict[str, type[Settings]] = {"swarm": SwarmConfig, "port": settings_class(args.air), "own": AgentSettings}
     settings = {setting.name: (name, setting) for name, cls in sections.items() for setting in settings_of(cls)}
     for name, value in values.items():
@@ -188,7 +187,6 @@ class RelayCommand(Command):
 Topics of any robots over the shared channel: /robot1/pose comes out as /robot2/from/robot1/pose, late, or not at all.
 A YAML file names robots, topics, places and the channel. Ctrl-C ends it."""
     examples = (("examples/relay.yaml", "two talkers that lose every fifth message"),)
-
     options = (
         ("file", "YAML file: robots, topics, channel", {"type": Path}),
         ("--use-sim-time", "time is that of /clock"),

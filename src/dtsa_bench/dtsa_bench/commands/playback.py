@@ -19,8 +19,8 @@ from .registry import RECORDED_RUN, Command, add_rows, warn
 if TYPE_CHECKING:
     from dtsa_bench.log.bag.replay import Player
     from dtsa_bench.pages.view.graph import GraphSource
+    from dtsa_bench.pages.view.history import PageCommand
     from dtsa_bench.pages.view.network_listener import NetworkListener
-    from dtsa_bench.pages.view.page_commands import PageCommand
     from dtsa_bench.pages.view.server import ViewServer
 
 
@@ -38,7 +38,6 @@ Other nodes follow it with use_sim_time:=true. Keys: space pauses and goes on, q
         ("runs/a", "in real time"),
         ("runs/a --rate 0.5 --start 2 --loop", "half as fast, from 2 s on, again and again"),
     )
-
     options = (
         ("bag", RECORDED_RUN),
         ("--rate R", "speed, 1 is real time (default 1)", {"type": float, "default": 1.0}),
@@ -76,10 +75,8 @@ Other nodes follow it with use_sim_time:=true. Keys: space pauses and goes on, q
                 signal.signal(signal.SIGINT, stop)
                 signal.signal(signal.SIGTERM, stop)
                 seconds = (bag.end_ns - bag.start_ns) / 1e9
-                print(
-                    f"playing {len(output.topics)} topics, {seconds:.2f} s of simulated time, at rate {args.rate:g}",
-                    flush=True,
-                )
+                what = f"{len(output.topics)} topics, {seconds:.2f} s of simulated time"
+                print(f"playing {what}, at rate {args.rate:g}", flush=True)
                 while args.wait_for_subscriber and not player.stopped and not output.subscribers():
                     time.sleep(0.02)
                 begin = time.monotonic() + args.delay
@@ -169,7 +166,7 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
             bags = " ".join(args.bags)
             raise ConfigError("bag", bags, f"none; a recorded run is shown by `{program()} report {bags}`")
         port = whole_number(args.port, "port", 0, 65535)
-        if args.listen is not None and not _plain_address(args.listen):
+        if args.listen is not None and not _is_address(args.listen):
             raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
         with suppress(OSError):
             os.nice(_NICE)
@@ -196,7 +193,7 @@ know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
         return 0
 
 
-def _plain_address(text: str) -> bool:
+def _is_address(text: str) -> bool:
     from ipaddress import ip_address
 
     try:

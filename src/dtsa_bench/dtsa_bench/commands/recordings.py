@@ -22,7 +22,6 @@ class VerifyCommand(Command):
 Rebuilds every agent and the channel from the recorded configuration, feeds them what they heard, and compares
 every message of the bag, byte by byte. Exit code 0: all equal; 1: a difference, which is shown."""
     examples = (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON"))
-
     options = (
         ("bag bag...", RECORDED_RUN),
         ("--json", "print the result as JSON"),
@@ -54,7 +53,6 @@ class RecoverCommand(Command):
 Makes a full bag of what a killed recorder, a full disk or a damaged file left: all that can be read. It says what was
 saved, and what is lost. The original is only read."""
     examples = (("runs/a", "into runs/a/bag_recovered"),)
-
     options = (
         ("bag", RECORDED_RUN),
         ("--out DIR", "where to (default: <bag>_recovered beside the old one)"),
@@ -92,7 +90,6 @@ column holds and in which unit."""
         ("runs/a", "all tables as Parquet"),
         ("runs/a --to csv --tables slots frames --out tables", "two of them as CSV"),
     )
-
     options = (
         ("bag", RECORDED_RUN),
         ("--to FORMAT", "parquet (default) or csv", {"default": "parquet"}),
@@ -126,7 +123,6 @@ Writes one self-contained HTML page about one recorded run, or several side by s
 distances, ages, estimate errors, channel use, decisions and the configuration. It opens without a network, and
 prints."""
     examples = (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side"))
-
     options = (
         ("bags BAG...", f"{RECORDED_RUN}; up to 8"),
         ("--out FILE", "the page (default: report.html beside the first bag)"),
@@ -162,7 +158,6 @@ bag take like any other."""
         ("runs/cf* --json", "all of them, as JSON"),
         ("runs/cf* --out flight_1", "kept as one bag, for report, export and verify"),
     )
-
     options = (
         ("bags BAG...", "directory of `agent --out`, or its .mcap file"),
         ("--air-us X", "a frame is on the air for so long: count overlaps [0]", {"default": "0"}),
@@ -176,16 +171,15 @@ bag take like any other."""
         from dtsa_bench.log.merge.merge import Merge, clocks_apart, is_verified
         from dtsa_bench.runs.options import check_free, number
 
-        out = Path(args.out) if args.out else None
-        if out is not None:
-            from dtsa_bench.log.merged_bag import write_merged
-
-            check_free(out)
+        if args.out:
+            check_free(Path(args.out))
         air_ns = round(number(args.air_us, "air_us", 0, 1e6, "us") * 1e3)
         merged = Merge(*read_all(args.bags))
         summary = merged.summary(air_ns)
-        if out is not None:
-            write_merged(out, merged.log, summary)
+        if args.out:
+            from dtsa_bench.log.merged_bag import write_merged
+
+            write_merged(Path(args.out), merged.log, summary)
         text = json.dumps(summary, indent=2) + "\n"
         print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
         if summary["unheard"]:
@@ -216,7 +210,6 @@ class LossesCommand(Command):
 Learns from recorded or merged flights what each directed link lost: its rate, and a two-state chain where losses come
 in bursts. --out writes a file that simulate, sweep and fly take as --losses."""
     examples = (("runs/a --out hall.json", "for simulate, sweep and fly, as --losses hall.json"),)
-
     options = (
         ("runs RUN...", "run directory, bag directory or .mcap file, also of merge"),
         ("--out FILE", "write a file of losses, JSON"),
@@ -243,23 +236,20 @@ in bursts. --out writes a file that simulate, sweep and fly take as --losses."""
 
 def loss_lines(losses: dict[str, Any]) -> list[str]:
     """Return what was learnt, in a few lines."""
-    agents = range(losses["agents"])
-    links = [
-        (losses["lost"][s][r] / sent, sent, s, r) for s in agents for r in agents if (sent := losses["sent"][s][r])
-    ]
+    agents, memory = range(losses["agents"]), losses["memory_slots"]
+    pairs = [(s, r, losses["sent"][s][r]) for s in agents for r in agents]
+    links = [(losses["lost"][s][r] / sent, sent, s, r) for s, r, sent in pairs if sent]
     rows = [
         f"{len(agents)} agents, {len(links)} links, slots of {losses['slot_ns'] / 1e6:g} ms: {losses['frames']} frames,"
         f" {sum(link[1] for link in links)} receptions, {100.0 * losses['loss']:.3g} % lost"
     ]
     if losses["left_out"]:
         rows.append("left out: " + "; ".join(f"{count} frames, {text}" for text, count in losses["left_out"].items()))
-    memory = losses["memory_slots"]
     rows.append(f"bursts: all links together have a memory of {memory:g} slots" if memory else "bursts: none found")
     rows.append("links that lose most:")
-    for loss, sent, sender, receiver in sorted(links, key=lambda link: -link[0])[:_SHOWN]:
-        leave, bad = losses["leave"][sender][receiver], losses["loss_bad"][sender][receiver]
-        phases = (
-            f"; bad phases of {1.0 / leave:.3g} slots, {100.0 * bad:.3g} % lost in them" if 0.0 < leave < 1.0 else ""
-        )
-        rows.append(f"  cf{sender + 1} -> cf{receiver + 1}: {100.0 * loss:.3g} % of {sent}{phases}")
+    for loss, sent, s, r in sorted(links, key=lambda link: -link[0])[:_SHOWN]:
+        leave, bad = losses["leave"][s][r], losses["loss_bad"][s][r]
+        is_bursty = 0.0 < leave < 1.0
+        phases = f"; bad phases of {1.0 / leave:.3g} slots, {100.0 * bad:.3g} % lost in them" if is_bursty else ""
+        rows.append(f"  cf{s + 1} -> cf{r + 1}: {100.0 * loss:.3g} % of {sent}{phases}")
     return rows

@@ -129,13 +129,17 @@ _HOW = {
 }
 
 
-def _explanation(error: ImportError) -> str:
-    """What is missing and how to get it; empty if the error is not about a package that we use."""
+def report_missing_package(program: str, error: ImportError) -> int:
+    """Print one line about a missing package; raise the error again if it is not about one that we use."""
     name = (error.name or "").split(".")[0]
     how = _HOW.get(name)
+    if how is None:
+        raise error
     if name == "dtsa_msgs" and not _is_installed("rclpy"):
         how = _ROS  # there is nothing to build a workspace on
-    return f"the Python package {name} is missing: {how.format(name)} (docs/how-to/install.md)" if how else ""
+    text = f"the Python package {name} is missing: {how.format(name)} (docs/how-to/install.md)"
+    print(f"{program}: error: {text}", file=sys.stderr)
+    return 2
 
 
 def _is_installed(name: str) -> bool:
@@ -143,15 +147,3 @@ def _is_installed(name: str) -> bool:
         return importlib.util.find_spec(name) is not None
     except (ImportError, ValueError):
         return False
-
-
-def report_missing_package(program: str, error: ImportError) -> int:
-    """Print one line about a missing package.
-
-    :raises ImportError: the error itself, if it is about something else.
-    """
-    text = _explanation(error)
-    if not text:
-        raise error
-    print(f"{program}: error: {text}", file=sys.stderr)
-    return 2

@@ -43,7 +43,7 @@ every slot has the same sender and every quadcopter the same positions as with `
 
     def run(self, args: argparse.Namespace) -> int:
         """Fly and print what came of it."""
-        from dtsa_agent.core import make_scenario
+        from dtsa_agent.core import ConfigError, make_scenario
         from dtsa_agent.keys import check_key
         from dtsa_bench.runs.options import new_directory, run_config
         from dtsa_bench.runs.summary_text import describe
@@ -52,7 +52,9 @@ every slot has the same sender and every quadcopter the same positions as with `
         config = run_config(args)
         check_key(config.swarm)  # before anything is made
         make_scenario(config.swarm)
-        picture = None if args.picture is None else _checked(Path(args.picture))
+        picture = None if args.picture is None else Path(args.picture)
+        if picture and (picture.suffix.lower() != ".png" or picture.is_dir() or not picture.parent.is_dir()):
+            raise ConfigError("picture", args.picture, "a file *.png in a directory that exists")
         directory = None if args.out is None else new_directory(args.out)
         flight = simulate(config, log=picture is not None)
         summary = flight.summary()
@@ -71,15 +73,6 @@ every slot has the same sender and every quadcopter the same positions as with `
                 draw_flight(picture, flight.scenario, flight.log.positions(), summary)
                 print(f"picture: {picture}", file=sys.stderr)
         return 0
-
-
-def _checked(picture: Path) -> Path:
-    """A file that a picture can be written to."""
-    from dtsa_agent.core.errors import ConfigError
-
-    if picture.suffix.lower() != ".png" or picture.is_dir() or not picture.parent.is_dir():
-        raise ConfigError("picture", str(picture), "a file *.png in a directory that exists")
-    return picture
 
 
 class SweepCommand(Command):

@@ -19,6 +19,7 @@ from . import palette
 from .style import INK, QUIET, style, svg_text, themed
 
 Array = NDArray[np.float64]
+Track = NDArray[np.float64]  # (T, 3, N) m, frame map; not a number where a position is not known
 
 _SHAPES = {"circle": "o", "diamond": "D", "square": "s", "triangle": "^"}
 _LABELLED = 24  # agents that get their ids written
@@ -28,7 +29,7 @@ _MOST_POINTS, _MOST_OF_ONE, _LEAST_OF_ONE = 8000, 80, 12  # in an SVG: of all pa
 
 def paint(
     axes: Axes,
-    path: Array,
+    path: Track,
     moving: NDArray[np.bool_],
     *,
     crash: Sequence[int] | None = None,
@@ -37,11 +38,8 @@ def paint(
 ) -> None:
     """Paint a flight from above: rings where agents start, discs where they end; agents that hover are grey discs.
 
-    :param path: (T, 3, N) m, frame map; not a number where a position is not known.
-    :param moving: (N,) which agents move.
     :param crash: ids of two agents that crashed at the end; a ring is drawn around them.
     :param ids: write the ids of the agents beside their starts, if there are few.
-    :param scale: of marks and lines.
     """
     known = np.isfinite(path[:, :2]).all(axis=1)  # (T, N)
     shown = np.flatnonzero(known.any(axis=0)).tolist()
@@ -97,21 +95,14 @@ def _mark_crash(axes: Axes, dots: Array, where: Array, crash: Sequence[int]) -> 
     axes.plot(*where, "o", mfc="none", mec="white", mew=4.0, markersize=22, zorder=7)
     axes.plot(*where, "o", mfc="none", mec=palette.COLLIDED, mew=1.8, markersize=22, zorder=8, gid="crash")
     axes.annotate(
-        f"crash {crash[0]}\u2013{crash[1]}",
-        where,
-        xytext=(float(text[0]), float(text[1])),
-        ha="center",
-        va="center",
-        color=palette.COLLIDED,
-        fontsize=9,
-        fontweight="bold",
-        zorder=8,
+        f"crash {crash[0]}\u2013{crash[1]}", where, xytext=(float(text[0]), float(text[1])), ha="center", va="center",
+        color=palette.COLLIDED, fontsize=9, fontweight="bold", zorder=8,
         arrowprops={"arrowstyle": "-", "color": palette.COLLIDED, "linewidth": 1.2, "shrinkA": 1, "shrinkB": 11},
         bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": palette.COLLIDED, "linewidth": 0.8},
-    )
+    )  # fmt: skip
 
 
-def frame_bare(axes: Axes, path: Array, fontsize: float = 6.5) -> None:
+def frame_bare(axes: Axes, path: Track, fontsize: float = 6.5) -> None:
     """Show all of a flight in a square without axes, with a bar of one metre."""
     extent = 1.2 * max(float(np.nanmax(np.abs(path[:, :2]), initial=0.0)), 0.5)
     axes.set(xlim=(-extent, extent), ylim=(-extent, extent), aspect="equal")
@@ -120,13 +111,10 @@ def frame_bare(axes: Axes, path: Array, fontsize: float = 6.5) -> None:
     axes.text(extent - 0.5, -extent * 0.93, "1 m", ha="center", va="bottom", fontsize=fontsize, color=QUIET)
 
 
-def svg_from_above(path: Array, moving: NDArray[np.bool_], name: str, crash: Sequence[int] | None = None) -> str:
+def svg_from_above(path: Track, moving: NDArray[np.bool_], name: str, crash: Sequence[int] | None = None) -> str:
     """A flight from above as SVG for a page, whose variables give paper and ink; parts have ids, as ``way-3``.
 
-    :param path: (T, 3, N) m, frame map; not a number where a position is not known.
-    :param moving: (N,) which agents move.
     :param name: what the picture shows, for readers who hear it.
-    :param crash: ids of two agents that crashed at the end.
     """
     points = min(_MOST_OF_ONE, max(_LEAST_OF_ONE, _MOST_POINTS // max(1, path.shape[2])))
     chosen = np.unique(np.linspace(0, len(path) - 1, min(points, len(path))).round().astype(int))
@@ -146,25 +134,18 @@ def svg_from_above(path: Array, moving: NDArray[np.bool_], name: str, crash: Seq
 
 def _subtitle(summary: dict[str, Any]) -> str:
     """The results of a flight in one short line."""
-    if summary["collided"]:
-        parts = ["crashed after {:.2f} s".format(summary["flight_time_s"])]
-    elif summary["completed"]:
-        parts = ["complete after {:.2f} s".format(summary["completion_time_s"])]
-    else:
-        parts = ["{} after {:.2f} s".format(summary["end"], summary["flight_time_s"])]
+    end = "crashed" if summary["collided"] else "complete" if summary["completed"] else summary["end"]
+    key = "completion_time_s" if end == "complete" else "flight_time_s"
+    parts = [f"{end} after {summary[key]:.2f} s"]
     if summary["min_distance_m"] is not None:
-        parts.append("closest {:.3f} m".format(summary["min_distance_m"]))
+        parts.append(f"closest {summary['min_distance_m']:.3f} m")
     if summary["efficiency_mean"] is not None:
-        parts.append("efficiency {:.3f}".format(summary["efficiency_mean"]))
+        parts.append(f"efficiency {summary['efficiency_mean']:.3f}")
     return "   ·   ".join(parts)
 
 
-def draw_flight(file: Path, scenario: Scenario, positions: Array, summary: dict[str, Any]) -> None:
-    """Draw one flight into a PNG.
-
-    :param positions: (T, 3, N) m, frame map.
-    :param summary: its results.
-    """
+def draw_flight(file: Path, scenario: Scenario, positions: Track, summary: dict[str, Any]) -> None:
+    """Draw one flight into a PNG, with its results."""
     built_in = POLICIES.rows.get(summary["policy"])  # a plug-in need not be installed where its flight is shown
     title = f"{built_in.label if built_in else summary['policy']}, {summary['estimator']}"
     places = np.concatenate((scenario.start[None], positions))

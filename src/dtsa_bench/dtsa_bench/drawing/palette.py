@@ -25,10 +25,7 @@ SENT, COLLIDED = "#e69f00", "#dc183c"
 
 
 def agent_colour(agent: int) -> str:
-    """The colour of an agent, ``#rrggbb``.
-
-    :param agent: its id, from 1.
-    """
+    """The colour of an agent, ``#rrggbb``, by its id, from 1."""
     return AGENT_COLOURS[(agent - 1) % len(AGENT_COLOURS)]
 
 

@@ -192,9 +192,9 @@ def run_all(
 ) -> dict[str, Row]:
     """Do the runs that the journal does not have yet; return all rows by key.
 
-    :param jobs: number of processes on this machine; None: one a core.
-    :param cluster: address of a Dask scheduler (``tcp://HOST:PORT``) instead.
-    :param advance: called after every chunk.
+    They are flown in `jobs` processes here (None: one a core), or on the Dask `cluster` at ``tcp://HOST:PORT``;
+    `advance` is called after every chunk.
+
     :raises ConfigError: if the cluster cannot be used.
     :raises DtsaError: if worker processes keep dying, or run other code.
     """

@@ -94,11 +94,8 @@ def league(name: str = "league-1") -> League:
 
 # -- entries -----------------------------------------------------------------------------------------------------------
 def make_entry(the_league: League, what: str, name: str | None, changes: Mapping[str, Any]) -> Entry:
-    """Return an entry without flights.
+    """Return an entry without flights of a scheme that comes with the package, or of a policy; `changes` win.
 
-    :param what: name of a scheme that comes with the package, or of a policy.
-    :param name: of the entry; None: that of the scheme or policy.
-    :param changes: settings of the scheme that win.
     :raises ConfigError: for a policy that does not exist, and what an entry may not set.
     """
     own = the_league.entrants.get(what, {"policy": what})
@@ -215,10 +212,8 @@ def _is_flight(flight: Sequence[Any]) -> bool:
 def check_entry(
     the_league: League, entry: Entry, *, sample: int | None, seed: int, jobs: int | None
 ) -> tuple[int, list[str]]:
-    """Fly a sample of an entry's flights again; return how many, and each value that differs.
+    """Fly a sample of an entry's flights again (None: all); return how many, and each value that differs.
 
-    :param sample: number of flights; None: all.
-    :param seed: decides which.
     :raises ConfigError: if its policy is not here.
     """
     check_scheme(entry["scheme"])

@@ -32,11 +32,9 @@ def check_format(form: str) -> None:
 def write_paper(table: SweepTable, directory: Path, form: str, code: str, command: str) -> list[str]:
     """Write figures, `table.tex` (booktabs), `table.csv` (a row a group) and `table.json` (how all was made).
 
-    Figures and the LaTeX table hold how they were made in themselves; a CSV file has no place for it that all readers
-    skip. Return the names of the files.
+    Figures and the LaTeX table hold how they were made in themselves: `code`, a digest, and `command`. A CSV file has
+    no place for it that all readers skip. Return the names of the files.
 
-    :param code: digest of the code that flew.
-    :param command: how the sweep was started.
     :raises ConfigError: for another format, or a directory that cannot be made.
     """
     check_format(form)

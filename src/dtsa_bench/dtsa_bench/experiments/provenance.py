@@ -29,9 +29,7 @@ def code_digest(plug_ins: frozenset[tuple[str, str]] = frozenset()) -> str:
     """Return a digest of this project's sources and compiled kernels, of plug-ins, and of Python and NumPy.
 
     A process computes it once, because it keeps the code that it has imported. Packages that a plug-in imports from
-    other distributions are left out.
-
-    :param plug_ins: kind and name of each plug-in that flies.
+    other distributions are left out. Plug-ins are kind and name.
     """
     digest = hashlib.sha256(f"Python {platform.python_version()} NumPy {np.__version__}".encode())
     for module in (*PROJECT, *sorted({module for kind, name in plug_ins for module in _modules_of(kind, name)})):

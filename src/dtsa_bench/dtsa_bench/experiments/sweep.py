@@ -142,7 +142,8 @@ def cost_of(settings: Mapping[str, Any]) -> float:
 def run_config(settings: Mapping[str, Any]) -> RunConfig:
     """Return a run from flat names: settings of the swarm, of the channel and of the limits side by side.
 
-    :param settings: values by name; ``seed`` is that of the swarm and of the channel.
+    ``seed`` is that of the swarm and of the channel.
+
     :raises ConfigError: for names that do not exist and values that are not allowed.
     """
     parts: dict[str, dict[str, Any]] = {section: {} for section in _SECTIONS}
@@ -200,10 +201,10 @@ def make_sweep(
     first_seed: int | None = None,
     base: Mapping[str, Any] | None = None,
 ) -> Sweep:
-    """Return a sweep from the content of its YAML file. Every run is checked here, before anything flies.
+    """Return a sweep from the content of its YAML file; `seeds` and `base` win over those of the file.
 
-    :param seeds: number of seeds, instead of the file's.
-    :param base: settings that win over the file's base.
+    Every run is checked here, before anything flies.
+
     :raises ConfigError: naming what is not usable.
     """
     spec = SweepSpec.from_dict(content)

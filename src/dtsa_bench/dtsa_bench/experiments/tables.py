@@ -154,10 +154,7 @@ def share_texts(share: Share, dash: str = "–") -> tuple[str, str]:
 
 
 class SweepTable:
-    """All rows and groups of a sweep, in its order.
-
-    :param finished: rows of the batch by key; runs without one are left out.
-    """
+    """All rows and groups of a sweep, in its order; runs without a finished row are left out."""
 
     def __init__(self, sweep: Sweep, finished: Mapping[str, Row]) -> None:
         self.sweep = sweep
@@ -220,10 +217,7 @@ def write_results(directory: Path, table: SweepTable, code: str) -> None:
 
 
 def aligned(lines: Sequence[Sequence[str]], rule: bool = False) -> str:
-    """Return lines of cells in columns, the head first, for a terminal.
-
-    :param rule: draw a line below the head.
-    """
+    """Return lines of cells in columns, the head first, for a terminal; `rule` draws a line below the head."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     padded = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines]
     if rule:
@@ -240,8 +234,7 @@ def markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 def table_text(table: SweepTable, width: int = 0, shown: Sequence[str] = SHOWN, most: int | None = None) -> str:
     """Return one line a group: crashes and means with their 95 % intervals. What is too wide goes on below.
 
-    :param width: characters in a line; 0: as many as it takes.
-    :param most: groups shown; None: all.
+    `width` is in characters, 0: as many as it takes; at most `most` groups are shown.
     """
     groups = table.groups_with_runs[:most]
     labels = [[axis, *(str(group.labels[axis]) for group in groups)] for axis in table.sweep.axes]
@@ -295,10 +288,9 @@ def _interval(point: tuple[float, float, float], low: float, high: float) -> str
 
 
 def latex_table(table: SweepTable, measures: Sequence[str], comments: Sequence[str]) -> str:
-    """Return a `tabular` with booktabs, a row a group: value and 95 % interval of each measure.
+    """Return a `tabular` with booktabs, a row a group: value and 95 % interval of each measure, or of :data:`CRASHED`.
 
-    :param measures: :data:`CRASHED`, and names of measures.
-    :param comments: lines that say how the table was made.
+    `comments` are lines that say how the table was made.
     """
     import pandas as pd
 

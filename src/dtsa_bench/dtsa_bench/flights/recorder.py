@@ -32,7 +32,6 @@ from dtsa_channel_sim.ros.run_topics import RunState, configuration_message
 
 from .slot_messages import SlotMessages
 
-_VIEW_NS = 50_000_000  # simulated time from one picture of the swarm to the next
 _WAIT_NS = 10_000_000_000  # for reports of agents that are not lost: a channel that stood still gets them late
 _REPORTED = ("chosen", "reason", "digest", "score", "offset_ns", "track", "velocity", "command", "goal")
 
@@ -46,7 +45,6 @@ class FlightRecorder(ChannelObserver):
 
     def __init__(self, directory: Path, run: RunConfig, scenario: Scenario, run_id: int) -> None:
         self._slot_ns, self._steps, self._run_id = run.swarm.slot_ns, run.swarm.steps, run_id
-        self._view_slots = max(1, round(_VIEW_NS / self._slot_ns))
         self._packed = SlotMessages(scenario, self._slot_ns, run_id)
         agents = run.swarm.agents
         custom = {"seed": str(run.swarm.seed), RUN_ID: f"{run_id:08x}", FORMAT_KEY: FORMAT}
@@ -134,7 +132,7 @@ class FlightRecorder(ChannelObserver):
             self._pending.append((self._record, self._packed.record(slot, answers, verdict), at))
         else:
             self._accounts.resolve(verdict)
-        if slot % self._view_slots == 0:
+        if slot % self._packed.view_slots == 0:
             motion = self._packer.pack(at, answers.position, answers.velocity)
             # Where an agent is that has not reported is not known: its report may come later, into the record alone.
             reported = zip(self._odometry, motion, answers.answered, strict=True)

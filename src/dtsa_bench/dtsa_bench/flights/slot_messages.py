@@ -20,7 +20,7 @@ from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 
 _ACCOUNT = ("chosen", "reason", "digest", "score", "track", "velocity", "command", "goal")
-_MARKER_PERIOD_NS = 50_000_000  # simulated
+_VIEW_NS = 50_000_000  # simulated time from one picture of the swarm to the next
 _RECEPTION = CdrMessage({
     "run": "I", "slot": "I", "outcome": "B", "sender": "*H", "received": "*B", "lost": "*H", "collided": "*H",
 })  # fmt: skip
@@ -43,6 +43,7 @@ class SlotMessages:
         self._scenario, self._slot_ns, self._run_id = scenario, slot_ns, run_id
         self._agents = scenario.start.shape[1]
         self._ids = array("H", range(1, self._agents + 1)).tobytes()
+        self.view_slots = max(1, round(_VIEW_NS / slot_ns))
         self._markers = MarkerPacker(range(1, self._agents + 1))
 
     def decision(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
@@ -58,11 +59,8 @@ class SlotMessages:
     def record(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
         """A dtsa_msgs/SlotRecord, without what agents with clocks of their own took in."""
         frames = {sender: data for sender in sorted(verdict.senders) if (data := answers.frames.get(sender))}
-        order = [verdict.senders.index(sender) for sender in frames]
-        lost, collided = (
-            [0] * len(order) if values is None else [values[row] for row in order]
-            for values in (verdict.lost, verdict.collided)
-        )
+        order, nothing = [verdict.senders.index(sender) for sender in frames], (0,) * len(verdict.senders)
+        lost, collided = ([(values or nothing)[row] for row in order] for values in (verdict.lost, verdict.collided))
         here = slice(None) if answers.answered.all() else np.flatnonzero(answers.answered)
         account = {name: getattr(answers, name)[..., here] for name in _ACCOUNT}
         return pack_record(
@@ -99,14 +97,14 @@ class LiveTopics(ChannelObserver):
     """
 
     def __init__(self, node: Node, scenario: Scenario, slot_ns: int, run_id: int, space: str = names.SWARM) -> None:
-        packed, every = SlotMessages(scenario, slot_ns, run_id), max(1, round(_MARKER_PERIOD_NS / slot_ns))
+        packed = SlotMessages(scenario, slot_ns, run_id)
         self._topics = [
             (node.create_publisher(kind, f"{space}/{topic}", 10), pack, slots)
             for topic, kind, pack, slots in (
                 (names.DECISION, Decision, packed.decision, 1),
                 (names.RECEPTION, Reception, packed.reception, 1),
                 ("slot_record", SlotRecord, packed.record, 1),
-                (names.MARKERS, MarkerArray, packed.markers, every),
+                (names.MARKERS, MarkerArray, packed.markers, packed.view_slots),
             )
         ]
         self._watched = [False] * len(self._topics)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -50,6 +50,12 @@ class ReceivedFrames(NamedTuple):
     before: Mask  # (H,) before the slot, by an agent that began with it
     data: list[bytes]
 
+    def part(self, first: int, last: int) -> ReceivedFrames:
+        """Those of rows from one to before another."""
+        a, b = np.searchsorted(self.row, (first, last)).tolist()
+        row, *others = (values[a:b] for values in self)
+        return ReceivedFrames(row - first, *others)
+
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class FlightArrays:
@@ -86,7 +92,7 @@ class FlightArrays:
     heard: ReceivedFrames | None = None  # in flights of agents with clocks of their own
     first_slot: int = 0  # number that the agents gave slot 0
     merged: dict[str, Any] | None = None  # what the log was merged from; None: it was recorded as one
-    earlier: FlightArrays | None = None  # of a merged one: slots before the first that all counted alike
+    whole: FlightArrays | None = None  # of a merged one: with the slots before the first that all counted alike
     results: dict[str, Any] | None = None  # the results where they are known already
     notes: list[str] = field(default_factory=list)  # what readers should know of the record
     file: Path | None = None  # where it is recorded
@@ -145,12 +151,16 @@ class FlightArrays:
 
     @property
     def missing(self) -> str:
-        """Slots and agents of which there is no record, in words; empty: none."""
-        absent = np.flatnonzero(~self.known.any(axis=0)) + 1 if len(self) else np.zeros(0, np.int64)
+        """Slots and agents of which there is no record, as "slots 158 to 313 and the motion of cf2"; empty: none."""
         if not self.is_kept:
             return ""
-        parts = (missing_slots(self.recorded), len(absent) and f"the motion of {', '.join(f'cf{k}' for k in absent)}")
-        return " and ".join(str(part) for part in parts if part)
+        edges = np.flatnonzero(np.diff(np.concatenate(([True], self.recorded, [True])).astype(np.int8)))
+        gaps = [f"{a} to {b - 1}" if a < b - 1 else f"{a}" for a, b in edges.reshape(-1, 2).tolist()]
+        more = f" and {len(gaps) - MAX_GAPS_LISTED} gaps more" if len(gaps) > MAX_GAPS_LISTED else ""
+        absent = np.flatnonzero(~self.known.any(axis=0)).tolist() if len(self) else []
+        parts = [f"slots {', '.join(gaps[:MAX_GAPS_LISTED])}{more}"] if gaps else []
+        parts += [f"the motion of {', '.join(f'cf{column + 1}' for column in absent)}"] if absent else []
+        return " and ".join(parts)
 
     @property
     def outcome_known(self) -> Mask:
@@ -197,11 +207,6 @@ class FlightArrays:
         rows = np.zeros(0, np.int64) if self.heard is None else self.heard.row
         return [int(end) for end in np.searchsorted(rows, np.arange(len(self) + 1))]
 
-    @property
-    def parts(self) -> list[FlightArrays]:
-        """The slots before the first that all agents of a merged flight counted alike, if there are some, and the rest."""
-        return [self] if self.earlier is None else [self.earlier, self]
-
     @cached_property
     def known_receivers(self) -> NDArray[np.int64]:
         """(F,) other agents of which is known whether they received a frame."""
@@ -211,7 +216,7 @@ class FlightArrays:
         return np.asarray(frames.received.sum(axis=1) + frames.lost, np.int64)
 
     @cached_property
-    def _instants(self) -> tuple[NDArray[np.int64], Floats, Floats]:
+    def _instants(self) -> tuple[Floats, Floats, Floats]:
         """Times (T,), positions and velocities (T, 3, N) of the control instants at which an agent was recorded."""
         self.check_kept()
         count, steps = self.track.shape[:2]
@@ -223,21 +228,17 @@ class FlightArrays:
             before = np.concatenate((velocity[:1, -1], velocity[:-1, -1]))[:, None]
             velocity[:, :-1] = before + (velocity[:, -1:] - before) * part  # only those at slots' starts are recorded
         times = (np.arange(count)[:, None] - 1) * self.slot_ns + (np.arange(steps) + 1) * self.slot_ns // steps
+        flown = times >= 0
         if self.merged is None:
-            flown = np.isfinite(self.track).all(axis=(2, 3)) & (times >= 0)
+            flown &= np.isfinite(self.track).all(axis=(2, 3))
         else:
-            flown = (times >= 0) & (times <= (count - 1 if self.has_end else count - 2) * self.slot_ns)
-        return times[flown], self.track[flown], velocity[flown]
-
-    @property
-    def instants_ns(self) -> NDArray[np.int64]:
-        """(T,) ns from the start of slot 0: the control instants of `path`."""
-        return self._instants[0]
+            flown &= times <= (count - 1 if self.has_end else count - 2) * self.slot_ns
+        return times[flown] / 1e9, self.track[flown], velocity[flown]
 
     @property
     def instants_s(self) -> Floats:
         """(T,) s from the start of slot 0: the control instants of `path`."""
-        return np.asarray(self._instants[0] / 1e9)
+        return self._instants[0]
 
     @property
     def path(self) -> Floats:
@@ -263,15 +264,6 @@ class FlightArrays:
 
 
 Log = TypeVar("Log", bound=FlightArrays)
-
-
-def missing_slots(recorded: Mask) -> str:
-    """The slots without a record, as "slots 158 to 313"; empty: there are none."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([True], recorded, [True])).astype(np.int8)))
-    gaps = [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
-    words = [f"{first} to {last}" if first < last else f"{first}" for first, last in gaps[:MAX_GAPS_LISTED]]
-    more = f" and {len(gaps) - MAX_GAPS_LISTED} gaps more" if len(gaps) > MAX_GAPS_LISTED else ""
-    return f"slots {', '.join(words)}{more}" if gaps else ""
 
 
 def recorded_config(settings: Mapping[str, Any]) -> RunConfig:
@@ -311,30 +303,18 @@ def empty_arrays(slots: int, agents: int, steps: int, slot_ns: int) -> dict[str,
 
 
 def split_log(log: Log, slot: int) -> Log:
-    """A log from a slot on; those before are kept as `earlier`.
+    """A log from a slot on; the log itself is kept as its `whole`.
 
     :raises ValueError: if the slot is not in it.
     """
     row = slot - log.first_slot
     if not 0 <= row <= len(log):
         raise ValueError(f"slot {slot}, the first common one, is not in it")
-    later = _slice(log, row, len(log))
-    later.earlier = _slice(log, 0, row) if row else None
-    return later
-
-
-def _slice(log: Log, first: int, last: int) -> Log:
     fields: dict[str, Any] = log.__getstate__()
     for name, values in fields.items():
-        if isinstance(values, np.ndarray) and name not in ("received", "track"):
-            fields[name] = values[first:last]
-    ends = np.concatenate(([0], np.cumsum(log.length.sum(axis=1, dtype=np.int64))))
-    fields["track"] = log.track[first : last + 1]
-    fields["data"] = log.data[int(ends[first]) : int(ends[last])]
-    fields["received"] = log.received[log.sent_ends[first] : log.sent_ends[last]]
-    if log.heard is not None:
-        a, b = log.heard_ends[first], log.heard_ends[last]
-        heard = ReceivedFrames(*(values[a:b] for values in log.heard))
-        fields["heard"] = heard._replace(row=heard.row - first)
-    fields["first_slot"] = log.first_slot + first
-    return type(log)(**fields)
+        if isinstance(values, np.ndarray) and name != "received":
+            fields[name] = values[row:]
+    fields["data"] = log.data[int(log.length[:row].sum(dtype=np.int64)) :]
+    fields["received"] = log.received[log.sent_ends[row] :]
+    fields["heard"] = log.heard and log.heard.part(row, len(log))
+    return type(log)(**fields | {"first_slot": slot, "whole": log})

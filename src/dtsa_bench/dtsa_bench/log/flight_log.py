@@ -13,7 +13,6 @@ from dtsa_agent.core.frame import named_in
 from dtsa_bench.drawing.card import as_html, as_text
 from dtsa_bench.runs.metrics import CRASHED
 from dtsa_bench.runs.summary_text import result_rows, setting_rows, what_came_of_it, what_flew
-
 from dtsa_bench.simulation.simulate import SimulatedFlight
 from dtsa_bench.simulation.slot_arrays import SlotWriter
 
@@ -25,6 +24,20 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from .knowledge import Knowledge
+
+
+class _Table(cached_property["pd.DataFrame"]):
+    """A table of a flight, made when it is first asked for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(self._make)
+        self.__doc__ = text
+
+    def _make(self, log: FlightLog) -> pd.DataFrame:
+        from .tables import table
+
+        log.check_kept()
+        return table(log, str(self.attrname))
 
 
 class FlightLog(FlightArrays):
@@ -46,66 +59,30 @@ class FlightLog(FlightArrays):
         """The results, with the keys of summary.json; empty where the log does not hold enough."""
         return self.knowledge.summary if self.results is None else self.results
 
-    # -- tables -------------------------------------------------------------------------------------------------------
-    def _table(self, name: str) -> pd.DataFrame:
-        from .tables import table
-
-        self.check_kept()
-        return table(self, name)
-
-    @cached_property
-    def slots(self) -> pd.DataFrame:
-        """A row a slot: slot, time_s (start), outcome, senders (how many), sender (id of the first, 0: nobody).
-
-        :raises ConfigError: if pandas is missing; likewise below.
-        """
-        return self._table("slots")
-
-    @cached_property
-    def frames(self) -> pd.DataFrame:
-        """A row a frame: slot, time_s, sender, received, lost, collided (receivers), length, data, and what it says."""
-        return self._table("frames")
-
-    @cached_property
-    def receptions(self) -> pd.DataFrame:
-        """Who received what, a row a frame and other agent: slot, time_s, sender, receiver, received (or not)."""
-        return self._table("receptions")
-
-    @cached_property
-    def decisions(self) -> pd.DataFrame:
-        """A row an agent and slot: slot, time_s, agent, chosen (id, 0: nobody), reason, score, digest of its table."""
-        return self._table("decisions")
-
-    @cached_property
-    def states(self) -> pd.DataFrame:
-        """A row an agent and instant: time_s, agent, position_{x,y,z}_m, velocity_{x,y,z}_mps, frame map."""
-        return self._table("states")
-
-    @cached_property
-    def ages(self) -> pd.DataFrame:
+    # -- tables, made when first asked for; pandas frames; ConfigError: pandas is missing ----------------------------
+    slots = _Table("A row a slot: slot, time_s (start), outcome, senders (count), sender (the first id, 0: nobody).")
+    frames = _Table("A row a frame: slot, time_s, sender, received, lost, collided (receivers), length, data and so on.")
+    receptions = _Table("A row a frame and other agent: slot, time_s, sender, receiver, received (or not).")
+    decisions = _Table("A row an agent and slot: slot, time_s, agent, chosen (id, 0: nobody), reason, score, digest.")
+    states = _Table("A row an agent and instant: time_s, agent, position_{x,y,z}_m, velocity_{x,y,z}_mps, frame map.")
+    ages = _Table(
         """A row a slot and agent: slot, time_s (end), agent, observers, age_slots, error_m: means over its observers.
 
         Not a number where nobody still expects the agent to move; no rows where the log does not hold enough.
         """
-        return self._table("ages")
-
-    @cached_property
-    def ages_by_observer(self) -> pd.DataFrame:
+    )
+    ages_by_observer = _Table(
         """A row a slot, observer and agent: slot, time_s (end), observer, agent, age_slots, error_m, counted.
 
         That is slots times agents squared: 5 s of 200 agents are 20 million rows.
         """
-        return self._table("ages_by_observer")
+    )
+    distances = _Table("Smallest distance of any two agents, a row an instant: time_s, distance_m.")
 
-    @cached_property
+    @property
     def errors(self) -> pd.DataFrame:
         """Estimates and the truth, a row a slot and agent: slot, time_s (end), agent, observers, error_m (mean)."""
         return self.ages[["slot", "time_s", "agent", "observers", "error_m"]]
-
-    @cached_property
-    def distances(self) -> pd.DataFrame:
-        """Smallest distance of any two agents, a row an instant: time_s, distance_m."""
-        return self._table("distances")
 
     def to_parquet(self, directory: str | Path, tables: Sequence[str] | None = None) -> list[Path]:
         """Write tables as Parquet files into a directory that is empty or does not exist yet; return the files.
@@ -180,5 +157,6 @@ def log_of_flight(flight: SimulatedFlight) -> FlightLog:
 def _received_frames(flight: SimulatedFlight, agents: int) -> ReceivedFrames:
     frames = flight.accepted or []
     row, slot = (np.array([getattr(frame, name) for frame in frames], np.int64) for name in ("row", "slot"))
-    by, none = np.array([frame.receivers for frame in frames], np.bool_).reshape(len(frames), agents), np.zeros_like(row)
+    by = np.array([frame.receivers for frame in frames], np.bool_).reshape(len(frames), agents)
+    none = np.zeros_like(row)
     return ReceivedFrames(row, none, slot, none, by, none.astype(np.bool_), [frame.data for frame in frames])

@@ -4,20 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Swarm
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.scenario import make_scenario
-from dtsa_bench.runs.delivery import DeliveryCounts, as_sentence
+from dtsa_bench.runs.delivery import as_sentence
 from dtsa_bench.runs.metrics import FlightMetrics
 
 from .arrays import UNKNOWN, FlightArrays, recorded_config
-from .merged_flight import follow_merged, observed_merged
-from .replay import MeanAges, ObservedPairs, knowledge_tables, replay_tables
+from .merged_flight import KnownSlot, MergedReplay
+from .replay import TableReplay
+
+
+@dataclass(frozen=True, slots=True)
+class MeanAges:
+    """By slot and agent: means over all observers that still have that agent in A_p; NaN without any."""
+
+    age: NDArray[np.float64]  # slots, (S, N)
+    error: NDArray[np.float64]  # m, (S, N)
+    observers: NDArray[np.int64]  # (S, N)
+    results: NDArray[np.bool_]  # (S,) slots that the means of a flight take
+
+
+class ObservedPairs(NamedTuple):
+    """What each observer knew of each other agent that it had heard, at the end of one slot: P pairs."""
+
+    slot: NDArray[np.int64]  # (P,)
+    observer: NDArray[np.int64]  # (P,) ids
+    agent: NDArray[np.int64]  # (P,) ids
+    age: NDArray[np.int64]  # slots, (P,)
+    error: NDArray[np.float64]  # m, (P,)
+    counted: NDArray[np.bool_]  # (P,) the observer still has it in A_p, and it moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +50,11 @@ class Knowledge:
 
 
 def knowledge_of(log: FlightArrays) -> Knowledge:
-    """What the agents of a log knew; computed once."""
-    found = log.__dict__.get("_knowledge")
-    if not isinstance(found, Knowledge):
-        found = log.__dict__["_knowledge"] = follow(log)
-    return found
+    """What the agents of a log knew, and the results, by the one definition of `FlightMetrics`; computed once."""
+    known = log.__dict__.get("_knowledge")
+    if not isinstance(known, Knowledge):
+        known = log.__dict__["_knowledge"] = _follow(log)
+    return known
 
 
 def why_without_ages(log: FlightArrays) -> str:
@@ -50,66 +70,87 @@ def why_without_ages(log: FlightArrays) -> str:
     return ""
 
 
-def follow(log: FlightArrays) -> Knowledge:
-    """What the agents knew of each other, and the results, by the one definition of `FlightMetrics`."""
-    why = why_without_ages(log)
-    if why:
+def _follow(log: FlightArrays) -> Knowledge:
+    if why := why_without_ages(log):
         return Knowledge(None, {}, [why])
-    if log.merged is not None:
-        return Knowledge(*follow_merged(log))
-    config, scenario = log.config, log.scenario
-    assert scenario is not None
-    tables, metrics, delivery = knowledge_tables(log), FlightMetrics(config, scenario), DeliveryCounts(log.agents)
-    ages, moving, shared = MeanAges.empty(len(log), log.agents), scenario.moving, _is_shared(tables)
-    ages.results[log.agents :] = True
-    own = np.zeros((len(tables.observer), log.agents), np.bool_)
-    if not shared:
-        own[np.arange(len(own)), tables.observer] = True
-    track, lengths = _filled(log.track), log.length
-    for row in replay_tables(log, tables, delivery):
-        metrics.compare_tables(row, log.digest[row], log.chosen[row])
-        outcome = int(log.outcome[row])
-        sizes = lengths[row][lengths[row] > 0].tolist()
-        metrics.update(row, track[row + 1], tables, outcome if outcome < UNKNOWN else 0, sizes)
-        _estimate(tables, row, track[row + 1, -1])
-        counted = (tables.in_ap != 0) & (tables.sent_slot >= 0) & moving & ~own
-        gap = tables.estimate_position - track[row + 1, -1]
-        ages.set_means(row, counted, row - tables.sent_slot, np.sqrt(np.einsum("vik,vik->vk", gap, gap)))
-    if shared:
-        ages.observers[:] *= log.agents - 1
-    notes = [as_sentence(problem)] if (problem := delivery.problem()) else []
-    return Knowledge(ages, metrics.summary(), notes)
+    replay = _replay_of(log)
+    shape = len(log), log.agents
+    age, error, observers = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.int64)
+    results = np.zeros(len(log), np.bool_)
+    for slot in replay:
+        counted, ages, gaps = slot.pairs()
+        counted &= slot.counted
+        observers[slot.row] = counted.sum(axis=0)
+        results[slot.row] = slot.results
+        some = observers[slot.row] > 0
+        for mean, values in ((age, ages), (error, gaps)):
+            mean[slot.row, some] = np.where(counted, values, 0).sum(axis=0)[some] / observers[slot.row, some]
+    if replay.is_shared:
+        observers *= log.agents - 1
+    return Knowledge(MeanAges(age, error, observers, results), replay.results or {}, replay.notes)
 
 
 def observed(log: FlightArrays) -> Iterator[ObservedPairs]:
     """What each observer knew, slot by slot; nothing where the log does not hold enough."""
     if why_without_ages(log):
         return
-    if log.merged is not None:
-        yield from observed_merged(log)
-        return
-    tables, moving, agents = knowledge_tables(log), log.moving, log.agents
-    others, track = ~np.eye(agents, dtype=np.bool_), _filled(log.track)
-    for row in replay_tables(log, tables):
-        _estimate(tables, row, track[row + 1, -1])
-        heard = np.broadcast_to(tables.sent_slot, (agents, agents))  # one table may stand for all
-        at, column = np.nonzero(others & (heard >= 0))
-        gap = np.sqrt(((tables.estimate_position - track[row + 1, -1]) ** 2).sum(axis=1))
-        counted = np.broadcast_to((tables.in_ap != 0) & moving, (agents, agents))[at, column]
-        error = np.broadcast_to(gap, (agents, agents))[at, column]
-        yield ObservedPairs(row, at + 1, column + 1, row - heard[at, column], error, counted)
+    replay, ids = _replay_of(log), np.arange(1, log.agents + 1)
+    for slot in replay:
+        expected, age, error = slot.pairs()
+        observers = ids if replay.is_shared else slot.tables.observer + 1  # one table may stand for those of all
+        known = (slot.tables.sent_slot >= 0) & (ids != observers[:, None])
+        if log.merged is not None:
+            expected &= slot.results
+            known &= log.known[slot.row, observers - 1][:, None]
+        at, column = np.nonzero(known)
+        values = [np.broadcast_to(array, known.shape)[at, column] for array in (age, error, expected & slot.counted)]
+        rows = np.full(len(at), slot.row, np.int64)
+        yield ObservedPairs(rows, observers[at].astype(np.int64), column + 1, *values)
 
 
-def _is_shared(tables: Swarm) -> bool:
-    return len(tables.observer) == 1 and int(tables.observer[0]) < 0
+def _replay_of(log: FlightArrays) -> _WholeReplay | MergedReplay:
+    return _WholeReplay(log) if log.merged is None else MergedReplay(log, compares=False)
 
 
-def _estimate(tables: Swarm, row: int, position: NDArray[np.float64]) -> None:
-    """Where the agents take each other to be at the end of a slot."""
-    if tables.config.estimator_row.needs_everybody:
-        tables.estimate_position[:] = position
-    else:
-        tables.estimate(row + 1)
+class _WholeReplay(TableReplay):
+    """The tables of all agents of a log that was recorded as one, slot by slot."""
+
+    def __init__(self, log: FlightArrays) -> None:
+        assert log.scenario is not None
+        everyone = log.heard is not None or bool(log.lost.any()) or bool(log.collided.any())
+        super().__init__(log.config, log.scenario, everyone)
+        self._log, self._metrics = log, FlightMetrics(log.config, log.scenario)
+
+    @property
+    def results(self) -> dict[str, Any]:
+        """The results, as in summary.json."""
+        return self._metrics.summary()
+
+    @property
+    def notes(self) -> list[str]:
+        """Why agents did not hear each other."""
+        return [as_sentence(problem)] if (problem := self.delivery.problem()) else []
+
+    def __iter__(self) -> Iterator[KnownSlot]:
+        log, metrics, sent = self._log, self._metrics, self._log.sent_frames
+        track, moving = _filled(log.track), log.moving
+        for row in range(len(log)):
+            frames = slice(log.sent_ends[row], log.sent_ends[row + 1])
+            self.delivery.add_slot(frames.stop - frames.start, sent.received[frames])
+            if log.heard is None:
+                slots = [row] * (frames.stop - frames.start)
+                heard = zip(slots, sent.data[frames], sent.received[frames], strict=True)
+                self.step(row, heard, sent.sender[frames].tolist())
+            else:
+                part = slice(log.heard_ends[row], log.heard_ends[row + 1])
+                columns = log.heard.slot[part].tolist(), log.heard.data[part], log.heard.receivers[part]
+                self.step(row, zip(*columns, strict=True))
+            metrics.compare_tables(row, log.digest[row], log.chosen[row])
+            outcome = int(log.outcome[row])
+            sizes = [len(data) for data in sent.data[frames]]
+            metrics.update(row, track[row + 1], self.tables, outcome if outcome < UNKNOWN else 0, sizes)
+            self.estimate(row + 1, track[row + 1, -1])
+            yield KnownSlot(row, row, self.tables, track[row + 1, -1], moving, row >= log.agents)
 
 
 def _filled(track: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -42,8 +42,8 @@ def learn(paths: list[str]) -> dict[str, Any]:
     """
     runs = [open_log(path) for path in paths]
     for name, text in (("agents", "{} agents"), ("slot_ns", "slots of {} ns")):
-        first, *others = [getattr(run, name) for run in runs]
-        for run, other in zip(runs[1:], others, strict=True):
+        for run in runs:
+            first, other = getattr(runs[0], name), getattr(run, name)
             if other != first:
                 raise ConfigError(name, f"{text.format(other)} in {run.name}", f"{first}, as in {runs[0].name}")
     left_out: Counter[str] = Counter()
@@ -95,14 +95,12 @@ def observe(run: FlightArrays, path: str | Path, left_out: Counter[str]) -> Outc
 def _without_unreached(run: FlightArrays, outcome: Array, rows: Array) -> Array:
     """Mark receivers as unknown that a frame did not reach, by the recorded channel; (F,) whether the numbers agree."""
     clear = np.zeros(len(outcome), np.bool_)
-    frames, config = run.sent_frames, run.usable_config
-    if config is None or not len(rows):
+    if run.usable_config is None:
         return clear
-    channel = Channel(config.air)
+    frames, channel = run.sent_frames, Channel(run.config.air)
     for row in rows.tolist():
-        slot, sender = int(frames.row[row]), int(frames.sender[row])
-        reached = channel.medium(slot).reach(sender, run.track[slot, -1])
-        heard = frames.received[row]
+        slot, heard = int(frames.row[row]), frames.received[row]
+        reached = channel.medium(slot).reach(int(frames.sender[row]), run.track[slot, -1])
         clear[row] = reached.sum() == heard.sum() + frames.lost[row] and not (heard & ~reached).any()
         outcome[row, ~reached & clear[row]] = UNKNOWN
     return clear
@@ -113,16 +111,14 @@ def fit_links(flights: list[Outcomes], agents: int) -> dict[str, Any]:
     sent, lost = np.zeros((2, agents, agents), np.int64)
     pairs: dict[tuple[int, int], list[Array]] = {}
     for slots, senders, outcome in flights:
-        for sender in np.unique(senders).tolist():
-            own = senders == sender
-            for receiver in range(agents):
-                known = outcome[own, receiver] != UNKNOWN
-                gone, when = outcome[own, receiver][known] == LOST, slots[own][known]
-                sent[sender - 1, receiver] += len(gone)
-                lost[sender - 1, receiver] += gone.sum()
-                for lag in range(1, min(_LAGS + 1, len(gone))):
-                    row = when[lag:] - when[:-lag], gone[:-lag], gone[lag:], np.full(len(gone) - lag, lag)
-                    pairs.setdefault((sender - 1, receiver), []).append(np.array(row))
+        for sender, receiver in np.ndindex(agents, agents):
+            known = (senders == sender + 1) & (outcome[:, receiver] != UNKNOWN)
+            gone, when = outcome[known, receiver] == LOST, slots[known]
+            sent[sender, receiver] += len(gone)
+            lost[sender, receiver] += gone.sum()
+            for lag in range(1, min(_LAGS + 1, len(gone))):
+                row = when[lag:] - when[:-lag], gone[:-lag], gone[lag:], np.full(len(gone) - lag, lag)
+                pairs.setdefault((sender, receiver), []).append(np.array(row))
     if not sent.any():
         raise ConfigError("runs", None, "a flight with one frame sent at least")
     mean = float(lost.sum() / sent.sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,17 +53,9 @@ def open_log(path: str | Path) -> FlightLog:
             if AGENT not in bag.custom_data:
                 return load_log(bag)
         bags = [Path(path)]
-    log = merge_bags(bags)
+    log = Merge(*read_all(bags)).log
     log.name, log.file = Path(path).resolve().stem, Path(path)
     return log
-
-
-def merge_bags(paths: Sequence[str | Path]) -> FlightLog:
-    """The log of a flight of which these are the agents' bags.
-
-    :raises ConfigError: for bags that are not of one flight, or have no common time line.
-    """
-    return Merge(*read_all(paths)).log
 
 
 def write_merged(directory: Path, log: FlightArrays, summary: Mapping[str, Any]) -> Path:
@@ -91,51 +83,41 @@ def write_merged(directory: Path, log: FlightArrays, summary: Mapping[str, Any])
 
 def _write_bag(directory: Path, log: FlightArrays) -> None:
     about = json.dumps(log.merged, sort_keys=True)
-    run = zlib.crc32(about.encode()) or 1
-    frames = {
-        (part.first_slot + row, sender): data
-        for part in log.parts
-        for row, sender, data in zip(*(part.sent_frames[k] for k in range(3)), strict=True)
-    }
+    run, whole = zlib.crc32(about.encode()) or 1, log.whole or log
     custom = {MERGED_FROM: about, RUN_ID: f"{run:08x}", FORMAT_KEY: FORMAT}
     with BagWriter(directory, log.settings, custom_data=custom) as bag:
         about_run = bag.add_topic(f"{names.SWARM}/{names.CONFIGURATION}", CONFIGURATION, "latched")
         bag.write(about_run, pack_configuration(run, log.settings), names.TIME_ZERO_NS, names.TIME_ZERO_NS)
         record, viewer = bag.add_topic(SLOT_RECORD, TYPE), _Viewer(bag, log.config.swarm)
-        for part in log.parts:
-            for row in range(len(part)):
-                slot = part.first_slot + row
-                at_ns = names.slot_time_ns(slot, log.slot_ns)
-                steps, outcome = part.track.shape[1], int(part.outcome[row])
-                data = pack_record(run, slot, at_ns, steps, outcome, **_record_fields(part, row, frames))
-                bag.write(record, data, at_ns, at_ns)
-                if part is log:
-                    viewer.show(part, row, at_ns)
+        for row in range(len(whole)):
+            slot, outcome = whole.first_slot + row, int(whole.outcome[row])
+            at_ns = names.slot_time_ns(slot, log.slot_ns)
+            data = pack_record(run, slot, at_ns, whole.track.shape[1], outcome, **_record_fields(whole, row))
+            bag.write(record, data, at_ns, at_ns)
+            if slot >= log.first_slot:
+                viewer.show(whole, row, at_ns)
 
 
-def _record_fields(log: FlightArrays, row: int, frames: Mapping[tuple[int, int], bytes]) -> dict[str, Any]:
-    """The fields of the record of a slot; `frames`: all that were sent, by slot and sender."""
-    slot, here, senders = log.first_slot + row, np.flatnonzero(log.known[row]), np.flatnonzero(log.length[row])
-    sent = {sender + 1: frames[slot, sender + 1] for sender in senders.tolist()}
+def _record_fields(log: FlightArrays, row: int) -> dict[str, Any]:
+    """The fields of the record of a slot."""
+    here, senders = np.flatnonzero(log.known[row]), np.flatnonzero(log.length[row])
     fields = {
         "agent": here + 1, **{name: getattr(log, name)[row, here] for name in (*DECIDED, "offset_ns")},
-        "track": log.track[row][:, :, here],
-        **{name: getattr(log, name)[row][:, here] for name in VECTORS},
-        **frame_fields(sent, log.received[log.sent_ends[row] : log.sent_ends[row + 1]]),
+        **{name: getattr(log, name)[row][..., here] for name in (*VECTORS, "track")},
+        **frame_fields(log.frames_in(row), log.received[log.sent_ends[row] : log.sent_ends[row + 1]]),
         **{name: getattr(log, name)[row, senders] for name in ("sent_ns", "lost", "collided")},
         "presence": [] if log.presence is None else log.presence[row, here],
     }  # fmt: skip
-    heard, part = log.heard, slice(log.heard_ends[row], log.heard_ends[row + 1])
-    if heard is None or part.start == part.stop:
+    heard = log.heard and log.heard.part(row, row + 1)
+    if not heard or not heard.data:
         return fields
     # Of a time that its sender gave up: the log has another frame of that slot.
-    keys = zip(heard.slot[part].tolist(), heard.sender[part].tolist(), heard.data[part], strict=True)
-    other = [b"" if frames.get((slot, sender)) == data else data for slot, sender, data in keys]
+    keys = zip((heard.slot - log.first_slot).tolist(), heard.sender.tolist(), heard.data, strict=True)
+    other = [b"" if 0 <= at < len(log) and log.frame(at, sender) == data else data for at, sender, data in keys]
     return fields | {
-        "heard_sender": heard.sender[part], "heard_slot": heard.slot[part],
-        "heard_ns": heard.time_ns[part] - log.start_ns[row],
-        "heard_by": np.frombuffer(pack_received(heard.receivers[part]), np.uint8),
-        "heard_before": heard.before[part] if heard.before[part].any() else [],
+        "heard_sender": heard.sender, "heard_slot": heard.slot, "heard_ns": heard.time_ns - log.start_ns[row],
+        "heard_by": np.frombuffer(pack_received(heard.receivers), np.uint8),
+        "heard_before": heard.before if heard.before.any() else [],
         "heard_length": [len(data) for data in other] if any(other) else [],
         "heard_data": np.frombuffer(b"".join(other), np.uint8),
     }  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,12 +18,28 @@ from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 from .arrays import FlightArrays
 from .bag.errors import UnusableBag
-from .replay import AgentReplay, MeanAges, ObservedPairs
+from .replay import AgentReplay
 from .rules import RuleChecker
 
 _FOREVER_S = 86_400.0
 _GAP_SLOTS = 50  # an agent that says nothing for longer has fallen out
 _KEPT = ("sent_position", "sent_velocity", "sent_intent", "sent_slot", "last_turn", "in_ap")
+_MERGED = (
+    "Merged from {count} agents' bags. Slot 0 is slot {common_slot} of the agents, the first that all counted alike. "
+    "Half of the frames fit the common time line within {p50:.0f} us, 99 % within {p99:.0f} us. A network does not say "
+    "why a frame was not received: it counts as lost."
+)
+_LEFT_OUT = {
+    "missing": "There is no bag of {}: what they did, and where they were, is not known.",
+    "broken_off": "The bags of {} break off: what they did afterwards is not known.",
+    "not_on_the_time_line": "Left out because frames do not go both ways between them and the others: {}.",
+    "nothing_written": "Nothing was written in {}.",
+}
+_RESULTS = (
+    "Results are those of slots {} to {}: from when no agent was on probation until the first agent ended. Completion "
+    "time counts from there."
+)
+_NO_RESULTS = "There are no results: at no time had all agents been heard, and none was on probation."
 # Of the results of other flights; the bags do not say how long frames of that port are on the air.
 _NOT_MEANT = ("end", "timed_out", "loss", "channel_load", "wall_time_s", "realtime_factor")
 
@@ -40,60 +55,57 @@ def slots_until_all_known(config: SwarmConfig) -> int:
     return (config.turn_every + 2) * config.agents
 
 
-class PairKnowledge:
+class _PairAges:
     """Pairs of two agents that are there: how many knew each other, and the oldest frame heard."""
 
-    def __init__(self, config: SwarmConfig, observers: Sequence[int]) -> None:
+    def __init__(self, log: FlightArrays) -> None:
+        self._log, config = log, log.config.swarm
         self._slot_ms, self._fresh = config.slot_ms, slots_until_all_known(config)
-        self._row = {agent: row for row, agent in enumerate(observers)}
-        self._heard: dict[tuple[int, int], int] = {}  # slot of the newest frame, by observer and sender
-        self._first = 0
-        self._pairs = self._known = self._age_max = 0
-        self._oldest: tuple[int, int] | None = None
+        self._newest = np.full((log.agents, log.agents), -1)  # slot of the newest frame that each heard of each
+        self._pairs = self._known = 0
+        self._oldest, self._pair = -1, (0, 0)
 
-    def add_received(self, log: FlightArrays, row: int) -> None:
+    def add_received(self, row: int) -> None:
         """Count what agents heard in a slot."""
-        if log.heard is None:
-            return
-        for k in range(log.heard_ends[row], log.heard_ends[row + 1]):
-            for column in np.flatnonzero(log.heard.receivers[k]).tolist():
-                pair, slot = (column + 1, int(log.heard.sender[k])), int(log.heard.slot[k])
-                self._heard[pair] = max(slot, self._heard.get(pair, slot))
+        heard = self._log.heard
+        for k in range(self._log.heard_ends[row], self._log.heard_ends[row + 1]) if heard is not None else ():
+            if 0 < heard.sender[k] <= self._log.agents:
+                newest = self._newest[:, heard.sender[k] - 1]
+                np.maximum(newest, heard.slot[k], out=newest, where=heard.receivers[k])
 
-    def start(self, slot: int) -> None:
-        """Count from a slot on; an agent that was never heard is as old as the results."""
-        self._first = slot
+    def add_slot(self, slot: int, first: int, here: Sequence[int], tables: Swarm) -> None:
+        """Count the end of a slot.
 
-    def add_slot(self, slot: int, here: Sequence[int], tables: Swarm) -> None:
-        """Count the end of a slot."""
-        for observer in here:
-            sent = tables.sent_slot[self._row[observer]].tolist()
-            for other in here:
-                if other == observer:
-                    continue
-                self._pairs += 1
-                self._known += sent[other - 1] >= max(0, slot - self._fresh)
-                age = slot - self._heard.get((observer, other), self._first - 1)
-                if age > self._age_max or self._oldest is None:
-                    self._age_max, self._oldest = age, (observer, other)
+        :param first: of the slots that count: an agent that was never heard is as old as they are.
+        """
+        column = np.array(here, np.int64) - 1
+        newest, others = self._newest[np.ix_(column, column)], column[:, None] != column
+        sent = tables.sent_slot[np.ix_(np.searchsorted(tables.observer, column), column)]
+        age = np.where(others, slot - np.where(newest < 0, first - 1, newest), -1)
+        self._pairs += int(others.sum())
+        self._known += int((sent >= max(0, slot - self._fresh))[others].sum())
+        if age.max(initial=-1) > self._oldest:
+            observer, sender = np.unravel_index(age.argmax(), age.shape)
+            self._oldest, self._pair = int(age.max()), (here[observer], here[sender])
 
     def summary(self) -> dict[str, Any]:
         """Plain values; None where no two were there."""
+        some = self._oldest >= 0
         return {
             "pairs_known_share": self._known / self._pairs if self._pairs else None,
-            "heard_age_max_slots": self._age_max if self._oldest else None,
-            "heard_age_max_ms": self._age_max * self._slot_ms if self._oldest else None,
-            "heard_age_max_pair": list(self._oldest) if self._oldest else None,
+            "heard_age_max_slots": self._oldest if some else None,
+            "heard_age_max_ms": self._oldest * self._slot_ms if some else None,
+            "heard_age_max_pair": list(self._pair) if some else None,
         }
 
 
 @dataclass(frozen=True, slots=True)
-class MergedSlot:
-    """The end of a slot."""
+class KnownSlot:
+    """The end of a slot, and what the agents know then."""
 
     row: int  # of the log
     slot: int  # as the agents count
-    tables: Swarm  # what the agents know, a row for each that has a bag
+    tables: Swarm  # what the agents know, with the estimates for this time
     position: NDArray[np.float64]  # m, (3, N), frame map, true; NaN where it is not known
     counted: NDArray[np.bool_]  # (N,) agents whose ages and errors the results take
     results: bool  # whether the results count the slot
@@ -102,7 +114,8 @@ class MergedSlot:
         """(V, N): whether an observer expects an agent to move, age (slots) and error (m; NaN: not known)."""
         tables = self.tables
         counted = (tables.in_ap != 0) & (tables.sent_slot >= 0)
-        counted[np.arange(len(counted)), tables.observer] = False
+        if tables.observer[0] >= 0:
+            counted[np.arange(len(counted)), tables.observer] = False
         gap = np.sqrt(((tables.estimate_position - self.position) ** 2).sum(axis=1))
         return counted, self.slot - tables.sent_slot, gap
 
@@ -110,31 +123,35 @@ class MergedSlot:
 class _Process:
     """A process of an agent, between the first and the last slot that it recorded."""
 
-    def __init__(self, config: SwarmConfig, about: Mapping[str, Any], compares: bool) -> None:
+    def __init__(self, log: FlightArrays, about: Mapping[str, Any], compares: bool) -> None:
         self.agent, self.first, self.last = (int(about[name]) for name in ("agent", "first", "last"))
         self.has_ended, self.is_broken_off = bool(about["ended_in_order"]), bool(about["broken_off"])
-        if not 1 <= self.agent <= config.agents:
+        if not 1 <= self.agent <= log.agents:
             raise ValueError(f"agent {self.agent}")
-        self.replay = AgentReplay(config, [self.agent], goals_told=bool(about["goals_told"]), compares=compares)
+        self.replay = AgentReplay(log, [self.agent], goals_told=bool(about["goals_told"]), compares=compares)
 
 
 class MergedReplay:
     """All agents of a merged flight; iterating replays them, and gives the slots from the common one on.
 
+    The results are from when all can have become known, (M + 2) N slots after the common one, and from when no agent is
+    new any more (until then they hover), until the first of them ends in order.
+
     :param compares: what they decide with the log; otherwise only what they know is followed.
     :raises UnusableBag: if what the log was merged from does not fit it.
     """
 
+    is_shared = False
+
     def __init__(self, log: FlightArrays, compares: bool = True) -> None:
         assert log.merged is not None
-        self._log, self._config = log, log.config.swarm
+        self._log, self._whole, self._config = log, log.whole or log, log.config.swarm
         try:
-            self.processes = [_Process(self._config, about, compares) for about in log.merged["processes"]]
+            self.processes = [_Process(self._whole, about, compares) for about in log.merged["processes"]]
         except (KeyError, ValueError, TypeError) as error:
             raise UnusableBag(log.file or log.name, f"its records do not fit together ({error})") from None
-        #: The results from when all can have become known, (M + 2) N slots after the common one, and from when no agent
-        #: is new any more (until then they hover), until the first of them ends in order; None: there are none.
-        self.results: dict[str, Any] | None = None
+        self.results: dict[str, Any] | None = None  # None: there are none
+        self._counted: tuple[int, int] | None = None  # first and last row of the log that they count
 
     @property
     def equal(self) -> int:
@@ -165,63 +182,73 @@ class MergedReplay:
             pass
         return self
 
-    def __iter__(self) -> Iterator[MergedSlot]:
-        log, config, scenario = self._log, self._config, make_scenario(self._config)
-        parts, agents = log.parts, log.agents
-        first = parts[0].first_slot
-        known = np.concatenate([part.known for part in parts])
-        observers = sorted({process.agent for process in self.processes})
-        if not observers:
+    def __iter__(self) -> Iterator[KnownSlot]:
+        log, config, scenario = self._whole, self._config, make_scenario(self._config)
+        observers = np.unique([process.agent for process in self.processes]).astype(np.int64)
+        if not len(observers):
             return
-        common = log.first_slot
-        begins = common + slots_until_all_known(config)
-        metrics, pairs = FlightMetrics(run_of(config), scenario), PairKnowledge(config, observers)
-        tables = make_swarm(config, scenario, local=[], observers=observers)
+        metrics, pairs = FlightMetrics(run_of(config), scenario), _PairAges(log)
+        tables = make_swarm(config, scenario, local=[], observers=observers.tolist())
+        copied = [
+            [(getattr(tables, name)[np.searchsorted(observers, process.agent)], getattr(process.replay.swarm, name)[0])
+             for name in _KEPT]
+            for process in self.processes
+        ]  # fmt: skip
         track = np.repeat(scenario.start[None], config.steps, axis=0)
-        last = min((process.last for process in self.processes if process.has_ended), default=first + len(known) - 1)
-        for agent in set(range(1, agents + 1)) - set(observers):
+        common = self._log.first_slot - log.first_slot
+        begins = common + slots_until_all_known(config)
+        ends = [process.last - log.first_slot for process in self.processes if process.has_ended]
+        last = min(ends, default=len(log) - 1)
+        for agent in set(range(1, log.agents + 1)) - set(observers.tolist()):
             metrics.lose(agent, hovers=False)
-        start: int | None = None  # of the results
-        for part, row in ((part, row) for part in parts for row in range(len(part))):
-            slot, index = part.first_slot + row, part.first_slot + row - first
+        start: int | None = None  # of the results, row
+        for row in range(len(log)):
+            slot = log.first_slot + row
             active = [
-                process
-                for process in self.processes
-                if process.first <= slot <= process.last and known[index, process.agent - 1]
-            ]
+                k for k, process in enumerate(self.processes)
+                if process.first <= slot <= process.last and log.known[row, process.agent - 1]
+            ]  # fmt: skip
             if not active:
                 continue
-            for process in active:
-                process.replay.step(part, row)
-                for name in _KEPT:
-                    getattr(tables, name)[observers.index(process.agent)] = getattr(process.replay.swarm, name)[0]
-            pairs.add_received(part, row)
-            counts = begins <= slot < last
-            if counts and start is None:
-                counts = not any(_is_new(process.replay.swarm) for process in active)
+            for k in active:
+                self.processes[k].replay.step(row)
+                for table, own in copied[k]:
+                    table[:] = own
+            pairs.add_received(row)
+            counts = begins <= row < last
+            if counts and start is None and config.policy_row.probation:
+                counts = not any(self.processes[k].replay.swarm.lease_status(0)["probation"] for k in active)
             if counts:
-                if start is None:
-                    start = slot
-                    pairs.start(slot)
-                here = _update_track(metrics, observers, known[index:], part.track[row + 1], track)
+                start = row if start is None else start
+                here = _update_track(metrics, observers.tolist(), log.known[row:], log.track[row + 1], track)
                 if len(here) > 1:
-                    metrics.compare_tables(slot, *_beliefs(part, row, here))
-                count = int(part.sent[row].sum())
+                    # Those that are not there have no say: they count as the first one that is.
+                    say, first = np.isin(np.arange(1, log.agents + 1), here), here[0] - 1
+                    beliefs = (np.where(say, one[row], one[row, first]) for one in (log.digest, log.chosen))
+                    metrics.compare_tables(slot, *beliefs)
+                count = int(log.sent[row].sum())
                 outcome = COLLISION if count > 1 else SUCCESS if count else IDLE
                 metrics.update(slot, track, tables, outcome, [config.frame_length] * count)
-                pairs.add_slot(slot, here, tables)
-            if part is log:
+                pairs.add_slot(slot, log.first_slot + start, here, tables)
+                self._counted = start - common, row - common
+            if row >= common:
                 tables.estimate(slot + 1)
-                yield MergedSlot(row, slot, tables, part.track[row + 1, -1], metrics.counted, counts)
-            for process in active:
-                if process.last == slot:  # it has ended: what it knew last does not grow old
-                    tables.in_ap[observers.index(process.agent)] = 0
-        self.results = None if start is None else _results(metrics, start) | pairs.summary()
+                yield KnownSlot(row - common, slot, tables, log.track[row + 1, -1], metrics.counted, counts)
+            for k in active:
+                if self.processes[k].last == slot:  # it has ended: what it knew last does not grow old
+                    tables.in_ap[np.searchsorted(observers, self.processes[k].agent)] = 0
+        self.results = None if start is None else _results(metrics, log.first_slot + start) | pairs.summary()
 
-
-def _is_new(swarm: Swarm) -> bool:
-    """Whether an agent is on probation: it sends at its anchors only, and hovers."""
-    return swarm.config.policy_row.probation and bool(swarm.lease_status(0)["probation"])
+    @property
+    def notes(self) -> list[str]:
+        """What to know of the flight, once it has been replayed."""
+        about = self._log.merged or {}
+        notes = [_MERGED.format(count=len(about["processes"]), **about, **about["residual_us"])]
+        for key, text in _LEFT_OUT.items():
+            if about.get(key):
+                named = ", ".join(f"cf{one}" if isinstance(one, int) else str(one) for one in about[key])
+                notes.append(text.format(named))
+        return [*notes, _NO_RESULTS if self._counted is None else _RESULTS.format(*self._counted)]
 
 
 def _update_track(
@@ -245,17 +272,6 @@ def _update_track(
         elif agent not in metrics.lost and not known[2:_GAP_SLOTS, column].any():
             metrics.lose(agent, hovers=False)
     return here
-
-
-def _beliefs(log: FlightArrays, row: int, here: Sequence[int]) -> tuple[Any, Any]:
-    """Digests and choices of those that are here; of the others, those of the first one: they have no say."""
-    columns, first = np.array(here) - 1, here[0] - 1
-    found = []
-    for values in (log.digest[row], log.chosen[row]):
-        beliefs = np.full_like(values, values[first])
-        beliefs[columns] = values[columns]
-        found.append(beliefs)
-    return found[0], found[1]
 
 
 def _results(metrics: FlightMetrics, first: int) -> dict[str, Any]:
@@ -293,79 +309,18 @@ def check_rules(log: FlightArrays, unsent: Mapping[tuple[int, int], bytes]) -> R
 
 def count_unmatched_frames(log: FlightArrays) -> int:
     """How many frames were heard that their sender's bag does not have, or has otherwise."""
-    about, processes = log.merged or {}, MergedReplay(log).processes
-    whole: set[int] = set()  # agents of whom all that they sent is there
+    about, whole = log.merged or {}, log.whole or log
+    if whole.heard is None:
+        return 0
+    complete: set[int] = set()  # agents of whom all that they sent is there
     if not about["nothing_written"] and not about["not_on_the_time_line"]:
-        whole = {process.agent for process in processes} - {p.agent for p in processes if p.is_broken_off}
-    gave_up = set(about.get("agents_that_gave_up_a_time", ()))
-    recorded = {key: data for part in log.parts for key, data in _recorded_frames(part)}
-    heard = Counter(
-        (slot, sender, data)
-        for part in log.parts
-        if part.heard is not None
-        for slot, sender, data in zip(part.heard.slot.tolist(), part.heard.sender.tolist(), part.heard.data, strict=True)
-    )
-    return sum(
-        count
-        for (slot, sender, data), count in heard.items()
-        if sender not in gave_up
-        and (data != recorded[slot, sender] if (slot, sender) in recorded else sender in whole)
-    )
-
-
-def _recorded_frames(log: FlightArrays) -> Iterator[tuple[tuple[int, int], bytes]]:
-    """Frames that their senders have recorded, by slot and sender."""
-    frames = log.sent_frames
-    for row, sender, data in zip(frames.row.tolist(), frames.sender.tolist(), frames.data, strict=True):
-        if log.known[row, sender - 1]:
-            yield (log.first_slot + row, sender), data
-
-
-# -- what the agents knew --------------------------------------------------------------------------------------------
-def follow_merged(log: FlightArrays) -> tuple[MeanAges, dict[str, Any], list[str]]:
-    """What the agents of a merged flight knew, and its results, by replaying all of them."""
-    ages, replay = MeanAges.empty(len(log), log.agents), MergedReplay(log, compares=False)
-    for slot in replay:
-        counted, age, error = slot.pairs()
-        ages.results[slot.row] = slot.results
-        ages.set_means(slot.row, counted & slot.counted, age, error)
-    return ages, replay.results or {}, _notes(log.merged or {}, np.flatnonzero(ages.results))
-
-
-def observed_merged(log: FlightArrays) -> Iterator[ObservedPairs]:
-    """What each observer of a merged flight knew, slot by slot; only those of which there is a record."""
-    for slot in MergedReplay(log, compares=False):
-        tables = slot.tables
-        expected, age, error = slot.pairs()
-        known = (tables.sent_slot >= 0) & log.known[slot.row][tables.observer][:, None]
-        known[np.arange(len(known)), tables.observer] = False
-        at, column = np.nonzero(known)
-        counted = expected & slot.counted & slot.results
-        observers = tables.observer[at] + 1
-        yield ObservedPairs(slot.row, observers, column + 1, age[at, column], error[at, column], counted[at, column])
-
-
-def _notes(about: Mapping[str, Any], results: Any) -> list[str]:
-    """What to know of a merged flight."""
-    residual = about["residual_us"]
-    notes = [
-        f"Merged from {len(about['processes'])} agents' bags. Slot 0 is slot {about['common_slot']} of the agents, the "
-        f"first that all counted alike. Half of the frames fit the common time line within {residual['p50']:.0f} us, "
-        f"99 % within {residual['p99']:.0f} us. A network does not say why a frame was not received: it counts as lost."
-    ]
-    for key, text in (
-        ("missing", "There is no bag of {}: what they did, and where they were, is not known."),
-        ("broken_off", "The bags of {} break off: what they did afterwards is not known."),
-        ("not_on_the_time_line", "Left out because frames do not go both ways between them and the others: {}."),
-        ("nothing_written", "Nothing was written in {}."),
-    ):
-        if about.get(key):
-            notes.append(text.format(", ".join(f"cf{one}" if isinstance(one, int) else str(one) for one in about[key])))
-    if len(results):
-        notes.append(
-            f"Results are those of slots {results[0]} to {results[-1]}: from when no agent was on probation until "
-            "the first agent ended. Completion time counts from there."
-        )
-    else:
-        notes.append("There are no results: at no time had all agents been heard, and none was on probation.")
-    return notes
+        complete = {one["agent"] for one in about["processes"]}
+        complete -= {one["agent"] for one in about["processes"] if one["broken_off"]}
+    count, gave_up = 0, about.get("agents_that_gave_up_a_time", ())
+    columns = whole.heard.slot.tolist(), whole.heard.sender.tolist(), whole.heard.data
+    for slot, sender, data in zip(*columns, strict=True):
+        row = slot - whole.first_slot
+        is_recorded = 0 <= row < len(whole) and 0 < sender <= whole.agents and whole.known[row, sender - 1]
+        sent = whole.frame(row, sender) if is_recorded else b""
+        count += (sent != data if sent else sender in complete) and sender not in gave_up
+    return count

@@ -123,7 +123,7 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
     slot_ns = round(float(slot_ms) * 1e6) if isinstance(slot_ms, (int, float)) and slot_ms > 0 else 10_000_000
     try:
         is_whole = merged is None and not {AGENT, SNIFFER} & set(bag.custom_data)
-        log = _make_log(list(records), agents, slot_ns, is_whole, _name(bag), settings)
+        log = make_log(list(records), agents, slot_ns, is_whole, _name(bag), settings)
         log.file, log.version, log.merged = bag.path, bag.custom_data.get("version", ""), merged
         if RECOVERED_FROM in bag.custom_data:
             log.notes.append("This bag was recovered: its recorder was killed or its file was damaged.")
@@ -167,7 +167,7 @@ _BY_AGENT = (*DECIDED, *VECTORS, "track", "offset_ns", "presence")
 _BY_SENDER, _MAY_BE_EMPTY = ("length", "lost", "collided", "sent_ns"), {"offset_ns", "presence", "sent_ns"}
 
 
-def _make_log(
+def make_log(
     records: Sequence[Any], agents: int, slot_ns: int, is_whole: bool, name: str, settings: dict[str, Any]
 ) -> FlightLog:
     """Put records into arrays.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping
-from itertools import chain
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,8 +19,7 @@ from dtsa_channel_sim.model.verdict import OUTCOMES
 
 from .arrays import FlightArrays, extent_of
 from .bag.errors import BagError
-from .knowledge import knowledge_of, observed, why_without_ages
-from .replay import ObservedPairs
+from .knowledge import ObservedPairs, knowledge_of, observed, why_without_ages
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -97,6 +97,8 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
 }  # fmt: skip
 _TEXTS = ("outcome", "reason", "data")
 
+Columns = Sequence[Any]  # values of a table's columns, in the order of `COLUMNS`
+
 
 def _pandas() -> Any:
     try:
@@ -113,8 +115,15 @@ def table(log: FlightArrays, name: str) -> pd.DataFrame:
     :raises ConfigError: if pandas is missing.
     """
     pandas = _pandas()
-    frames = [pandas.DataFrame(block) for block in _BUILDERS[name](log)]
+    frames = [pandas.DataFrame(block) for block in _blocks(log, name)]
     return frames[0] if len(frames) == 1 else pandas.concat(frames, ignore_index=True)
+
+
+def _blocks(log: FlightArrays, name: str) -> Iterator[dict[str, Any]]:
+    """Rows of a table, by columns; a large table is several blocks."""
+    names = [column for column, _, _ in COLUMNS[name]]
+    blocks = _ages_by_observer(log) if name == "ages_by_observer" else [_BUILDERS[name](log)]
+    return (dict(zip(names, block, strict=True)) for block in blocks)
 
 
 def _masked(values: Any, unknown: Any) -> Any:
@@ -126,154 +135,94 @@ def _masked(values: Any, unknown: Any) -> Any:
     return kind(values, np.ascontiguousarray(unknown))
 
 
-def _texts(names: Any, index: Any, unknown: Any = None) -> Any:
-    found = np.array(names, dtype=object)[index]
-    if unknown is not None:
-        found[unknown] = None
-    return found
-
-
-Block = dict[str, Any]
-
-
-def _slots(log: FlightArrays) -> Iterator[Block]:
+def _slots(log: FlightArrays) -> Columns:
     here = np.flatnonzero(log.recorded)
     sent, unknown = log.sent[here], ~log.outcome_known[here]
-    yield {
-        "slot": here,
-        "time_s": log.time_s(here),
-        "outcome": _texts((*OUTCOMES, ""), log.outcome[here], unknown),
-        "senders": _masked(sent.sum(axis=1), unknown),
-        "sender": _masked(np.where(sent.any(axis=1), sent.argmax(axis=1) + 1, 0), unknown),
-    }
+    outcome = np.array((*OUTCOMES, ""), dtype=object)[log.outcome[here]]
+    outcome[unknown] = None
+    first = np.where(sent.any(axis=1), sent.argmax(axis=1) + 1, 0)
+    return here, log.time_s(here), outcome, _masked(sent.sum(axis=1), unknown), _masked(first, unknown)
 
 
-def _frames(log: FlightArrays) -> Iterator[Block]:
-    frames, extent, inside = log.sent_frames, extent_of(log.settings), _opener(log)
-    decoded = [_decode(inside(data), extent) for data in frames.data]
-    values = np.array([row[1:] for row in decoded], np.float64).reshape(-1, 6)
-    c_r = np.array([-1 if row[0] is None else row[0] for row in decoded], np.int64)
-    block: Block = {
-        "slot": frames.row,
-        "time_s": log.time_s(frames.row),
-        "sender": frames.sender,
-        "received": frames.received.sum(axis=1),
-        "lost": frames.lost,
-        "collided": _masked(frames.collided, np.full(len(frames.row), log.merged is not None)),
-        "length": np.array([len(data) for data in frames.data], np.int64),
-        "data": np.array([data.hex() for data in frames.data], dtype=object),
-        "c_r": _masked(c_r, c_r < 0),
-    }
-    names = [f"position_{axis}_m" for axis in AXES] + [f"velocity_{axis}_mps" for axis in AXES]
-    yield block | {name: values[:, index] for index, name in enumerate(names)}
+def _frames(log: FlightArrays) -> Columns:
+    frames, extent, config = log.sent_frames, extent_of(log.settings), log.usable_config
+    plain = frames.data if config is None else [config.swarm.protocol_part(data, sealed=True) for data in frames.data]
+    c_r, *vectors = np.array([_decode(data, extent) for data in plain], np.float64).reshape(-1, 7).T
+    unknown = np.isnan(c_r)
+    return (
+        frames.row, log.time_s(frames.row), frames.sender, frames.received.sum(axis=1), frames.lost,
+        _masked(frames.collided, np.full(len(frames.row), log.merged is not None)),
+        np.array([len(data) for data in frames.data], np.int64), np.array([data.hex() for data in frames.data], object),
+        _masked(np.where(unknown, -1, c_r).astype(np.int64), unknown), *vectors,
+    )  # fmt: skip
 
 
-def _opener(log: FlightArrays) -> Callable[[bytes], bytes]:
-    """A function that takes from a frame what authentication and plug-ins have appended to it."""
-    config = log.usable_config
-    if config is None:
-        return lambda data: data
-    return lambda data: config.swarm.protocol_part(data, sealed=True)
-
-
-def _decode(data: bytes, extent_m: float) -> tuple[Any, ...]:
+def _decode(data: bytes, extent_m: float) -> tuple[float, ...]:
+    """c_r, position and velocity in a frame; not numbers if it cannot be decoded."""
     try:
         frame = decode_frame(data, extent_m)
     except RemoteProtocolError:
-        return (None,) * 7
+        return (np.nan,) * 7
     return (frame.c_r, *frame.position, *frame.velocity)
 
 
-def _receptions(log: FlightArrays) -> Iterator[Block]:
+def _receptions(log: FlightArrays) -> Columns:
     frames, ids = log.sent_frames, np.arange(1, log.agents + 1)
     row, column = np.nonzero(ids[None, :] != frames.sender[:, None])
     slots, received = frames.row[row], frames.received[row, column]
     unknown = ~(received | log.known[slots, column]) if log.merged is not None else np.zeros(len(row), np.bool_)
-    yield {
-        "slot": slots,
-        "time_s": log.time_s(slots),
-        "sender": frames.sender[row],
-        "receiver": ids[column],
-        "received": _masked(received, unknown),
-    }
+    return slots, log.time_s(slots), frames.sender[row], ids[column], _masked(received, unknown)
 
 
-def _decisions(log: FlightArrays) -> Iterator[Block]:
+def _decisions(log: FlightArrays) -> Columns:
     slots, column = np.nonzero(log.known)
-    names = [*REASONS, *(str(code) for code in range(len(REASONS), 256))]
-    yield {
-        "slot": slots,
-        "time_s": log.time_s(slots),
-        "agent": column + 1,
-        "chosen": log.chosen[slots, column].astype(np.int64),
-        "reason": _texts(names, log.reason[slots, column]),
-        "score": log.score[slots, column],
-        "digest": log.digest[slots, column],
-    }
+    reasons = np.array([*REASONS, *(str(code) for code in range(len(REASONS), 256))], dtype=object)
+    chosen, reason, score, digest = (
+        getattr(log, name)[slots, column] for name in ("chosen", "reason", "score", "digest")
+    )
+    return slots, log.time_s(slots), column + 1, chosen.astype(np.int64), reasons[reason], score, digest
 
 
-def _states(log: FlightArrays) -> Iterator[Block]:
-    time_s, path = log.instants_s, log.path
-    block: Block = {
-        "time_s": np.repeat(time_s, log.agents),
-        "agent": np.tile(np.arange(1, log.agents + 1), len(time_s)),
-    }
-    for values, form in ((path, "position_{}_m"), (log.path_velocity, "velocity_{}_mps")):
-        block |= {form.format(axis): values[:, index].ravel() for index, axis in enumerate(AXES)}
-    if log.merged is not None:  # no rows for those of whom there is no record
-        known = np.isfinite(path).all(axis=1).ravel()
-        block = {name: values[known] for name, values in block.items()}
-    yield block
+def _states(log: FlightArrays) -> Columns:
+    time_s, agents = log.instants_s, np.arange(1, log.agents + 1)
+    vectors = [values[:, axis].ravel() for values in (log.path, log.path_velocity) for axis in range(3)]
+    columns = [np.repeat(time_s, log.agents), np.tile(agents, len(time_s)), *vectors]
+    if log.merged is None:
+        return columns
+    known = np.isfinite(log.path).all(axis=1).ravel()  # no rows for those of whom there is no record
+    return [values[known] for values in columns]
 
 
-def _ages(log: FlightArrays) -> Iterator[Block]:
-    ages = knowledge_of(log).ages
-    slot = np.repeat(np.arange(0 if ages is None else len(log)), log.agents)
-    none = np.zeros(0)
-    yield {
-        "slot": slot,
-        "time_s": log.time_s(slot + 1),
-        "agent": np.tile(np.arange(1, log.agents + 1), len(slot) // log.agents),
-        "observers": none.astype(np.int64) if ages is None else ages.observers.ravel(),
-        "age_slots": none if ages is None else ages.age.ravel(),
-        "error_m": none if ages is None else ages.error.ravel(),
-    }
+def _ages(log: FlightArrays) -> Columns:
+    ages, none = knowledge_of(log).ages, np.zeros(0)
+    if ages is None:
+        return [none.astype(kind) for kind in (np.int64, float, np.int64, np.int64, float, float)]
+    slot, agent = (place.ravel() for place in np.indices(ages.age.shape))
+    return slot, log.time_s(slot + 1), agent + 1, ages.observers.ravel(), ages.age.ravel(), ages.error.ravel()
 
 
-_OF_PAIRS: dict[str, tuple[str, Any]] = {  # columns, of which field of ObservedPairs, and of which kind
-    "observer": ("observer", np.int64), "agent": ("agent", np.int64), "age_slots": ("age", np.int64),
-    "error_m": ("error", np.float64), "counted": ("counted", np.bool_),
-}  # fmt: skip
+def _ages_by_observer(log: FlightArrays) -> Iterator[Columns]:
+    none = np.zeros(0, np.int64)
+    empty = ObservedPairs(none, none, none, none, np.zeros(0), none.astype(np.bool_))
+    pairs = observed(log)
+    for slots in chain([next(pairs, empty)], pairs):
+        part = [slots, *islice(pairs, max(0, ROWS // log.agents**2 - 1))]
+        slot, *others = (np.concatenate(columns) for columns in zip(*part, strict=True))
+        yield slot, log.time_s(slot + 1), *others
 
 
-def _ages_by_observer(log: FlightArrays) -> Iterator[Block]:
-    waiting: list[ObservedPairs] = []
-    rows, is_first = 0, True
-    for pairs in chain(observed(log), [None]):
-        if pairs is not None:
-            waiting.append(pairs)
-            rows += len(pairs.agent)
-        if rows >= ROWS or (pairs is None and (rows or is_first)):
-            slot = np.concatenate([np.zeros(0, np.int64), *(np.full(len(part.agent), part.slot) for part in waiting)])
-            yield {"slot": slot, "time_s": log.time_s(slot + 1), **{
-                name: np.concatenate([np.zeros(0, kind), *(getattr(part, field) for part in waiting)])
-                for name, (field, kind) in _OF_PAIRS.items()
-            }}  # fmt: skip
-            waiting, rows, is_first = [], 0, False
-
-
-def _distances(log: FlightArrays) -> Iterator[Block]:
+def _distances(log: FlightArrays) -> Columns:
     path = log.path
     closest = np.full(len(path), np.inf)
     for k in range(path.shape[2] - 1):
         between = np.linalg.norm(path[:, :, k + 1 :] - path[:, :, k : k + 1], axis=1)
         closest = np.fmin(closest, np.nanmin(between, axis=1, initial=np.inf))
-    yield {"time_s": log.instants_s, "distance_m": closest}
+    return log.instants_s, closest
 
 
-_BUILDERS: Mapping[str, Callable[[FlightArrays], Iterator[Block]]] = {
+_BUILDERS: Mapping[str, Callable[[FlightArrays], Columns]] = {
     "slots": _slots, "frames": _frames, "receptions": _receptions, "decisions": _decisions, "states": _states,
-    "ages": _ages, "ages_by_observer": _ages_by_observer, "distances": _distances,
+    "ages": _ages, "distances": _distances,
 }  # fmt: skip
 
 
@@ -316,7 +265,7 @@ def export(
         part.mkdir(parents=True)
         for name in COLUMNS if tables is None else [name for name in COLUMNS if name in tables]:
             file = f"{name}.{kind}"
-            written.append(ExportedTable(target / file, _write(part / file, kind, name, _BUILDERS[name](flight))))
+            written.append(ExportedTable(target / file, _write(part / file, kind, name, _blocks(flight, name))))
         has_ages = tables is None or {"ages", "ages_by_observer"} & set(tables)
         if note and has_ages and (why := why_without_ages(flight)):
             note(why)
@@ -332,30 +281,23 @@ def export(
     return written
 
 
-def _write(file: Path, kind: str, name: str, blocks: Iterator[Block]) -> int:
+def _write(file: Path, kind: str, name: str, blocks: Iterator[dict[str, Any]]) -> int:
     import pyarrow as pa
     import pyarrow.csv
     import pyarrow.parquet
 
     notes = {column: {"unit": unit, "meaning": meaning} for column, unit, meaning in COLUMNS[name]}
-    writer: Any = None
-    rows = 0
-    try:
+    kinds = {column: pa.string() if column in _TEXTS else None for column in notes}
+    make = pyarrow.parquet.ParquetWriter if kind == "parquet" else pyarrow.csv.CSVWriter
+    rows, schema = 0, None
+    with ExitStack() as stack:
         for block in blocks:
-            columns = {
-                name: pa.array(values, pa.string() if name in _TEXTS else None, from_pandas=True)
-                for name, values in block.items()
-            }
-            found = pa.table(columns)
-            if writer is None:
-                schema = pa.schema([field.with_metadata(notes[field.name]) for field in found.schema])
-                make = pyarrow.parquet.ParquetWriter if kind == "parquet" else pyarrow.csv.CSVWriter
-                writer = make(str(file), schema)
-            writer.write_table(found.cast(schema))
-            rows += found.num_rows
-    finally:
-        if writer is not None:
-            writer.close()
+            part = pa.table({key: pa.array(values, kinds[key], from_pandas=True) for key, values in block.items()})
+            if schema is None:
+                schema = pa.schema([field.with_metadata(notes[field.name]) for field in part.schema])
+                writer = stack.enter_context(make(str(file), schema))
+            writer.write_table(part.cast(schema))
+            rows += part.num_rows
     return rows
 
 

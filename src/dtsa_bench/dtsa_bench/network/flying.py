@@ -116,21 +116,17 @@ class _Terminal:
     """Standard error: lines about an agent, and on a terminal a last line that changes."""
 
     def __init__(self, agent: int) -> None:
-        self._agent, self._shown = agent, False
+        self._name, self._clear = f"cf{agent}", "\r\x1b[K" if sys.stderr.isatty() else ""
 
     def log(self, line: str) -> None:
-        """Prints a line that stays."""
-        self.clear()
-        print(f"dtsa: cf{self._agent}: {line}", file=sys.stderr, flush=True)
+        """Print a line that stays."""
+        print(f"{self._clear}dtsa: {self._name}: {line}", file=sys.stderr, flush=True)
 
     def show(self, line: str) -> None:
-        """Shows a line in place of the one before."""
+        """Show a line in place of the one before."""
         columns = shutil.get_terminal_size().columns
-        print(f"\r\x1b[K{f'cf{self._agent}: {line}'[: columns - 1]}", end="", file=sys.stderr, flush=True)
-        self._shown = True
+        print(f"{self._clear}{f'{self._name}: {line}'[: columns - 1]}", end="", file=sys.stderr, flush=True)
 
     def clear(self) -> None:
-        """Takes that line away."""
-        if self._shown:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-        self._shown = False
+        """Take that line away."""
+        print(self._clear, end="", file=sys.stderr, flush=True)

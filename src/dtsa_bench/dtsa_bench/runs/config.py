@@ -18,11 +18,7 @@ class RunLimits(Settings):
     """What ends a run, and what counts as a crash."""
 
     timeout_s: float = setting(
-        60.0,
-        "a run that is not complete by then ends and is counted apart",
-        unit="s",
-        minimum=0.01,
-        maximum=86400,
+        60.0, "a run that is not complete by then ends and is counted apart", unit="s", minimum=0.01, maximum=86400
     )
     tail_s: float = setting(1.0, "a complete run flies on for this long", unit="s", minimum=0, maximum=3600)
     collision_m: float = setting(0.2, "two agents closer than this have crashed", unit="m", minimum=0, maximum=10)
@@ -50,12 +46,10 @@ class RunConfig(Settings):
         check(self)
         if self.channel is None:
             object.__setattr__(self, "channel", ChannelConfig(**from_swarm(self.swarm)))
-        for name, there, here in (
-            ("agents", self.air.agents, self.swarm.agents),
-            ("slot_ns", self.air.slot_ns, self.swarm.slot_ns),
-        ):
-            if there != here:
-                raise ConfigError(f"channel.{name}", there, f"{here}, as in the swarm")
+        for name in ("agents", "slot_ns"):
+            value, right = getattr(self.air, name), getattr(self.swarm, name)
+            if value != right:
+                raise ConfigError(f"channel.{name}", value, f"{right}, as in the swarm")
         self._check_radio()
 
     def _check_radio(self) -> None:

@@ -30,6 +30,10 @@ Array = NDArray[np.float64]
 COMPLETED, CRASHED, TIMED_OUT, STOPPED = "completed", "crashed", "timed out", "stopped"
 ENDS = ("", COMPLETED, CRASHED, TIMED_OUT)  # in the order of libdtsa_sim/metrics.h
 
+_LOSSES = (  # settings of the channel
+    "loss", "burst_length", "p_good", "jam", "partition", "range_m", "capture_db", "loss_matrix", "link_loss", "losses",
+    "schedule",
+)  # fmt: skip
 _DELAYS = lib.METRICS_DELAYS
 _update, _compare = lib.metrics_update, lib.metrics_compare  # once a slot
 
@@ -37,8 +41,6 @@ _update, _compare = lib.metrics_update, lib.metrics_compare  # once a slot
 def metrics_tables(run: RunConfig, scenario: Scenario, everyone: bool) -> Swarm:
     """Tables that follow a flight from what the air carried, for callers that do not host all agents.
 
-    :param run: the run.
-    :param scenario: its scenario.
     :param everyone: one table an agent, which any loss needs; otherwise one that stands for all.
     """
     observers = list(range(1, run.swarm.agents + 1)) if everyone else [0]
@@ -49,25 +51,10 @@ def may_share(run: RunConfig) -> bool:
     """Whether one table may stand for all agents: nothing is ever lost, and all would decide the same.
 
     In slots that a frame may outlast the channel names each frame's receivers, for which one table has no room.
-
-    :param run: the run.
     """
-    air, swarm = run.air, run.swarm
-    lossless = not (
-        air.loss
-        or air.burst_length
-        or air.p_good
-        or air.jam
-        or air.partition
-        or air.range_m
-        or air.capture_db
-        or air.loss_matrix
-        or air.link_loss
-        or air.losses
-        or air.schedule
-        or air.airtime.total_ns(air.airtime.longest) > air.slot_ns
-    )
-    return lossless and can_share_table(swarm)
+    air, longest_ns = run.air, run.air.airtime.total_ns(run.air.airtime.longest)
+    is_lossless = not any(getattr(air, name) for name in _LOSSES) and longest_ns <= air.slot_ns
+    return is_lossless and can_share_table(run.swarm)
 
 
 class FlightMetrics:
@@ -75,9 +62,6 @@ class FlightMetrics:
 
     Ages leave out those that an observer takes to stand: a mover that nobody has heard since it set out is in none of
     them. Ages from waking on begin with the goal, for every receiver, heard or not.
-
-    :param run: the run.
-    :param scenario: its scenario.
     """
 
     def __init__(self, run: RunConfig, scenario: Scenario) -> None:
@@ -207,9 +191,8 @@ class FlightMetrics:
         return bool((np.sqrt((away * away).sum(axis=0)) <= self.run.swarm.r_min).all())
 
     def compare_tables(self, slot: int, digests: NDArray[np.uint32], chosen: NDArray[np.uint16]) -> None:
-        """Takes in what all agents believe at the start of a slot, where that may differ.
+        """Take in what all agents believe at the start of a slot, where that may differ.
 
-        :param slot: its number.
         :param digests: (N,) digests of their tables, equal where tables are equal.
         :param chosen: (N,) ids that they take for the slot's sender.
         """
@@ -237,9 +220,9 @@ class FlightMetrics:
         return {int(k) + 1: float(direct[k] / path[k]) for k in np.flatnonzero(self._moving) if path[k] > 0.0}
 
     def summary(self, wall_time_s: float | None = None) -> dict[str, Any]:
-        """The results as plain values; what does not exist (no movers, not complete, ...) is None.
+        """The results as plain values, with the wall-clock time that the flight took, s.
 
-        :param wall_time_s: wall-clock time that the flight took, s.
+        What does not exist (no movers, not complete, ...) is None.
         """
         swarm, sums = self.run.swarm, self.kernel
         flown = self.slots * swarm.slot_ns / 1e9
@@ -248,26 +231,14 @@ class FlightMetrics:
         efficiency = list(self.efficiencies().values())
         airtime = self.run.air.airtime
         on_air_s = sum(airtime.on_air_ns(length) * count for length, count in self._frames.items()) / 1e9
+        outcomes = {"success": SUCCESS, "collision": COLLISION, "idle": IDLE}
         return {
-            "agents": swarm.agents,
-            "moving": swarm.movers,
-            "policy": swarm.policy,
-            "estimator": swarm.estimator,
-            "avoider": swarm.avoider,
-            "slot_ms": swarm.slot_ms,
-            "loss": self.run.air.loss,
-            "seed": swarm.seed,
-            "end": self.end or STOPPED,
-            "completed": self.completion_slot >= 0,
-            "timed_out": self.end == TIMED_OUT,
+            "agents": swarm.agents, "moving": swarm.movers, "policy": swarm.policy, "estimator": swarm.estimator,
+            "avoider": swarm.avoider, "slot_ms": swarm.slot_ms, "loss": self.run.air.loss, "seed": swarm.seed,
+            "end": self.end or STOPPED, "completed": self.completion_slot >= 0, "timed_out": self.end == TIMED_OUT,
             "collided": self.crash_slot >= 0,
             "collided_pair": list(self.collided_pair) if self.collided_pair else None,
-            "slots": {
-                "total": self.slots,
-                "success": sums.outcomes[SUCCESS],
-                "collision": sums.outcomes[COLLISION],
-                "idle": sums.outcomes[IDLE],
-            },
+            "slots": {"total": self.slots, **{name: sums.outcomes[code] for name, code in outcomes.items()}},
             "min_distance_m": math.sqrt(sums.min_distance2) if pair else None,
             "min_distance_pair": pair,
             "min_distance_time_s": sums.min_slot * swarm.slot_ns / 1e9 if pair else None,
@@ -290,7 +261,7 @@ class FlightMetrics:
             "estimate_error_max_m": sums.error_max if news else None,
             "wall_time_s": wall_time_s,
             "realtime_factor": flown / wall_time_s if wall_time_s else None,
-        }
+        }  # fmt: skip
 
     def _waking_results(self) -> dict[str, Any]:
         """Return what became of the agents that got goals; None where none did."""

@@ -34,7 +34,10 @@ def setting_rows(run: RunConfig) -> list[tuple[str, str]]:
     """All settings of a run as rows of name and text, those of swarm, channel and limits one after the other."""
     sections: tuple[tuple[str, Settings], ...] = (("swarm", run.swarm), ("channel", run.air), ("limits", run.limits))
     return [
-        (f"{section}.{spec.name}", _with_unit(getattr(settings, spec.name), spec.unit))
+        (
+            f"{section}.{spec.name}",
+            _short(getattr(settings, spec.name)) + f" {spec.unit}" * (spec.unit not in ("", "1")),
+        )
         for section, settings in sections
         for spec in settings_of(type(settings))
     ]
@@ -56,12 +59,11 @@ def what_came_of_it(summary: Mapping[str, Any], run: RunConfig) -> list[tuple[st
     rows = [("outcome", _outcome(known))]
     for name, key in (("ages", "age"), ("from waking", "waking_age")):
         if f"{key}_mean_slots" in known:
-            mean, most = (
-                f"{_three(known[f'{key}_{of}_slots'])} slots ({_three(known[f'{key}_{of}_ms'])} ms)" for of in _OF
-            )
+            values = [(known[f"{key}_{of}_slots"], known[f"{key}_{of}_ms"]) for of in ("mean", "max")]
+            mean, most = (f"{_three(slots)} slots ({_three(ms)} ms)" for slots, ms in values)
             rows.append((name, f"{mean} on average, {most} at most"))
     if "estimate_error_mean_m" in known:
-        mean, most = (f"{_three(1000 * known[f'estimate_error_{of}_m'])} mm" for of in _OF)
+        mean, most = (f"{_three(1000 * known[f'estimate_error_{of}_m'])} mm" for of in ("mean", "max"))
         rows.append(("errors", f"{mean} on average, {most} at most, of where the others are thought to be"))
     if "min_distance_m" in known:
         pair = " and ".join(map(str, known.get("min_distance_pair", ())))
@@ -73,9 +75,6 @@ def what_came_of_it(summary: Mapping[str, Any], run: RunConfig) -> list[tuple[st
         parts = ", ".join(f"{count[name]} {name}" for name in ("success", "collision", "idle"))
         rows.append(("slots", f"{count['total']} of {run.swarm.slot_ms:g} ms: {parts}"))
     return [*rows, ("channel", _channel(known, run))]
-
-
-_OF = ("mean", "max")
 
 
 def _outcome(known: Mapping[str, Any]) -> str:
@@ -96,22 +95,17 @@ def _outcome(known: Mapping[str, Any]) -> str:
 
 def _channel(known: Mapping[str, Any], run: RunConfig) -> str:
     changed = {name: value for name, value in run.air.not_default().items() if name not in FROM_SWARM}
-    told = ", ".join(f"{name} {_short(value)}" for name, value in changed.items()) or "loss 0"
-    parts = []
+    parts = [", ".join(f"{name} {_short(value)}" for name, value in changed.items()) or "loss 0"]
     if "frames_per_s" in known:
         parts.append(f"{_three(known['frames_per_s'])} frames/s")
     if "channel_load" in known:
         parts.append(f"on the air {_three(100 * known['channel_load'])} % of the time")
-    return "; ".join((told, *parts))
+    return "; ".join(parts)
 
 
 def _three(value: float) -> str:
     """Three digits, all of a larger number."""
     return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
-
-
-def _with_unit(value: object, unit: str) -> str:
-    return f"{_short(value)} {unit}" if unit not in ("", "1") else _short(value)
 
 
 def _short(value: object) -> str:

@@ -161,10 +161,9 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begins a flight.
+        """Begin a flight; returns observations and (empty) infos by agent.
 
         :param seed: its seed, as in `simulate`; None: the one after that of the last flight.
-        :returns: observations and (empty) infos by agent.
         """
         seed = self._next_seed if seed is None else seed
         swarm_config = replace(self.run.swarm, seed=seed)

@@ -105,9 +105,6 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         self._config = replace(self._config, seed=self._next_seed if seed is None else seed)
         self._next_seed = self._config.seed + 1
         self._transport, self._step = Transport(self._config), 0
-        self._newest = np.full((len(self._names), len(self._names)), -1)  # step of each receiver's known values
-        # What each agent received of others: by receiver and sender, and in it for each receiver.
-        self._known = {name: dict.fromkeys(parts, self._first) for name, parts in self._parts.items()}
         return self._exchange(*self.env.reset(seed=seed, options=options), {})
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
@@ -133,27 +130,25 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         for sender, name in enumerate(names, 1):
             if name in sent and present[sender - 1]:
                 self._transport.send(RadioMessage(sender, "", step, self._size, now_ns, present, sent[name]))
-        for message, received in self._transport.advance(now_ns + self._step_ns, self._places()):
-            column = message.sender - 1
-            newer = received & (self._newest[:, column] < message.number)
-            self._newest[newer, column] = message.number
-            for row in np.flatnonzero(newer).tolist():
-                self._known[names[row]][names[column]] = message.payload
+        self._transport.advance(now_ns + self._step_ns, self._places())
         completed: dict[str, Any] = {}
-        for name, own in observations.items():
-            known = {other: self._known[name][other][name] for other in self._parts[name]}
-            if self._space is not None:
-                completed[name] = {"observation": own, "messages": known}
-                continue
-            completed[name] = np.array(own)
-            for other, part in self._parts[name].items():
-                completed[name][part] = known[other][part]
-        ages = np.where(self._newest < 0, -1, step - self._newest).tolist()
-        for name, row in zip(names, ages, strict=True):
+        completed_infos = dict(infos)
+        for name, newest in zip(names, self._transport.newest, strict=True):
+            received = {other: message for other, message in zip(names, newest, strict=True) if other != name}
             if name in infos:
-                age = {other: age for other, age in zip(names, row, strict=True) if other != name}
-                infos[name] = {**infos[name], "age": age}
-        return completed, infos
+                age = {other: step - message.number if message else -1 for other, message in received.items()}
+                completed_infos[name] = {**infos[name], "age": age}
+            if name not in observations:
+                continue
+            parts, first = self._parts[name], self._first[name]
+            known = {other: received[other].payload[name] if received[other] else first for other in parts}
+            if self._space is not None:
+                completed[name] = {"observation": observations[name], "messages": known}
+                continue
+            completed[name] = np.array(observations[name])
+            for other, part in parts.items():
+                completed[name][part] = known[other][part]
+        return completed, completed_infos
 
     def _places(self) -> NDArray[np.float64] | None:
         """Return where agents are, (3, N), m."""

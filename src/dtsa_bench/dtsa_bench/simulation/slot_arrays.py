@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Swarm
 from dtsa_agent.core.authentication import TAG_LENGTH
-from dtsa_agent.core.kernel import ffi, lib, memory
+from dtsa_agent.core.kernel import ffi, lib, memory, shared_arrays
 from dtsa_channel_sim import Verdict
 
 Floats = NDArray[np.float64]
@@ -81,9 +81,9 @@ class SlotWriter:
         self.kernel = ffi.new("sim_log *", {"observer": observer - 1, "frame_bytes": config.frame_length})
         self._lent: dict[str, Any] = {}
         left_out = {*(() if frames else ("data",)), *(() if observer else _OF_OBSERVER)}
-        self._kept = [name for name in _SHAPES if name not in left_out]
-        for name, letters in _SHAPES.items():
-            setattr(self._arrays, name, np.empty((0, *(sizes[letter] for letter in letters)), _ITEMS[name]))
+        self._kept = [name for name in _ARRAYS if name not in left_out]
+        for name, (letters, item) in _ARRAYS.items():
+            setattr(self._arrays, name, np.empty((0, *(sizes[letter] for letter in letters)), item))
         self._grow(_CAPACITY, _CAPACITY + config.agents)
 
     def make_room(self) -> None:
@@ -137,9 +137,4 @@ class SlotWriter:
         return arrays
 
 
-_SHAPES: dict[str, str] = {
-    name: hint.__metadata__[0]
-    for name, hint in get_type_hints(SlotArrays, include_extras=True).items()
-    if hasattr(hint, "__metadata__")
-}
-_ITEMS = {n: kind.type.item.cname.removesuffix("_t") for n, kind in ffi.typeof("sim_log").fields if n in _SHAPES}
+_ARRAYS = shared_arrays(SlotArrays, "sim_log")

@@ -6,7 +6,6 @@ import re
 import runpy
 import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -201,47 +200,6 @@ def test_a_closed_terminal_lands_all_and_sigterm_is_no_second_ctrl_c(tmp_path: P
         assert started.end(signal.SIGTERM) == 0, started.text()  # as `ros2 launch` does after five seconds
         assert "EMERGENCY" not in started.text()
         assert gone(fleet)
-
-
-NESTED = """
-import os, signal, sys
-from dtsa_agent.crazyflie.node import bridge_node
-
-interrupts, left, first = bridge_node._Interrupts(), int(sys.argv[1]), signal.getsignal(signal.SIGTERM)
-
-
-def traced(frame, event, argument):
-    global left
-    if event == "line":
-        left -= 1
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGINT)
-    return traced
-
-
-def handle(number, frame):
-    sys.settrace(traced)
-    first(number, frame)
-    sys.settrace(None)
-
-
-signal.signal(signal.SIGTERM, handle)
-os.kill(os.getpid(), signal.SIGTERM)
-interrupts.wait()
-print(interrupts.count, left)
-"""
-
-
-def test_two_signals_at_once_are_seen() -> None:
-    """The second one comes at each line of the first one's handler in turn; nobody lands if it waits for the first."""
-    for line in range(1, 40):
-        command = [sys.executable, "-c", NESTED, str(line)]
-        count, left = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.split()
-        if int(left) > 0:  # the handler has fewer lines
-            assert line > 3
-            return
-        assert int(count) in (1, 2)  # one if Ctrl-C came before the other one counted
-    raise AssertionError("the handler has too many lines")
 
 
 def test_killed_it_takes_the_simulated_ones_along(tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def test_two_as_near_as_in_a_crash_or_somebody_who_may_still_fly_fail_a_mission(
     run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
     metrics, ended = FlightMetrics(run, make_scenario(swarm)), StopToken(Stop())
     mission: Any = SimpleNamespace(ended=ended, check_bridge_process=lambda: None)
-    watch, status = MissionWatch(mission, MagicMock(), metrics), ChannelStatus(0, {}, [])
+    watch, status = MissionWatch(mission, MagicMock(), metrics), ChannelStatus(0, [])
     watch.idle(status)
     assert not ended.reason
     metrics.update(0, np.array([[[0.0, 0.19, 2.0], [0.0] * 3, [0.0] * 3]]), None, 0)
@@ -324,6 +324,7 @@ def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
         config = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45)
         data = yaml.safe_load(config.read_text())
         data["robots"] = {"north_7": data["robots"]["cf1"], "south": data["robots"]["cf2"]}
+        data["station"]["max_speed_mps"] = 0.2  # a landing takes ten seconds: the second signal comes before its end
         config.write_text(yaml.safe_dump(data, sort_keys=False))
         with mission("--config", str(config), "--out", str(tmp_path / "out")) as process:
             wait_for(lambda: streaming(fleet), 60)

@@ -58,10 +58,10 @@ def sniff(live: LiveLaboratory) -> list[bytes]:
         heard.append(transfer[7:])
         dongle.sniffer.read()
 
-    dongle.request(requests.SET_CHANNEL, 80, 0, b"", 0)
-    dongle.request(requests.SET_RATE, 2, 0, b"", 0)
-    dongle.request(requests.SET_SNIFFER_ADDRESS, 0, 0, BROADCAST, 0)
-    dongle.request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
+    dongle.request(requests.SET_CHANNEL, 80, b"", 0)
+    dongle.request(requests.SET_RATE, 2, b"", 0)
+    dongle.request(requests.SET_SNIFFER_ADDRESS, 0, BROADCAST, 0)
+    dongle.request(requests.SET_RADIO_MODE, 1, b"", 0)
     dongle.sniffer.give = give
     dongle.sniffer.read()
     return heard

@@ -44,9 +44,9 @@ class Room:
 
     def tune(self, dongle: int, to: RadioAddress) -> None:
         d = self.dongles[dongle]
-        d.request(requests.SET_CHANNEL, to.channel, 0, b"", 0)
-        d.request(requests.SET_ADDRESS, 0, 0, to.address, 0)
-        d.request(requests.SET_RATE, RATE_NAMES.index(to.rate), 0, b"", 0)
+        d.request(requests.SET_CHANNEL, to.channel, b"", 0)
+        d.request(requests.SET_ADDRESS, 0, to.address, 0)
+        d.request(requests.SET_RATE, RATE_NAMES.index(to.rate), b"", 0)
 
     def exchange(self, packet: bytes, at_ns: int = 0, dongle: int = 0) -> list[tuple[int, bytes]]:
         """When the answer to a packet came (ns), and the answer."""
@@ -122,7 +122,7 @@ def test_two_dongles_on_one_channel_collide_and_on_two_channels_do_not() -> None
 def test_a_broadcast_reaches_all_on_its_channel_and_is_not_answered() -> None:
     room = Room(stations=(station(1), station(2), station(3, 60), station(4, 80, "1M")))
     room.tune(0, RadioAddress("", 80, "2M", BROADCAST))
-    room.dongles[0].request(requests.ACK_ENABLE, 0, 0, b"", 0)
+    room.dongles[0].request(requests.ACK_ENABLE, 0, b"", 0)
     assert room.exchange(PACKET) == []
     assert room.exchange(PACKET[:16] * 2 + bytes(10)) == [], "more than 32 bytes: two packets"
     assert [k for k, _ in room.heard] == [0, 1, 0, 1, 0, 1]
@@ -132,7 +132,7 @@ def test_losses_come_from_the_seed_and_are_as_many_as_were_ordered() -> None:
     def acknowledged(seed: int) -> list[bool]:
         room = Room(RadioSettings(dongles=1, request_ms=0.0, loss=0.3, seed=seed), (station(1),))
         room.tune(0, room.stations[0])
-        room.dongles[0].request(6, 0, 0, b"", 0)  # no retries
+        room.dongles[0].request(6, 0, b"", 0)  # no retries
         return [room.exchange(NULL, at_ns=k * 10_000 * US)[0][1] != b"\0" for k in range(400)]
 
     first = acknowledged(7)
@@ -152,7 +152,7 @@ def test_the_bridges_budget_is_what_a_dongle_carries(rate: str, count: int) -> N
     while now < 503_000 * US:
         to = exchanges % count
         if count > 1:
-            room.dongles[0].request(requests.SET_ADDRESS, 0, 0, stations[to].address, now)
+            room.dongles[0].request(requests.SET_ADDRESS, 0, stations[to].address, now)
         room.receivers[to].push(bytes((0x5C,)) + bytes(budget.DOWN_BYTES - 1))
         ((now, answer),) = room.exchange(bytes((0x7C,)) + bytes(budget.UP_BYTES - 1), now)
         assert answer[0] & 1
@@ -166,7 +166,7 @@ def test_what_the_devices_cannot_do() -> None:
         room.tune(0, room.stations[0])
         assert (room.exchange(PACKET)[0][1] != b"\0") is there, (device, rate, channel)
     room = Room(RadioSettings(dongles=2, device="pa"), ())
-    room.dongles[0].request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
+    room.dongles[0].request(requests.SET_RADIO_MODE, 1, b"", 0)
     assert room.dongles[0].sniffer.tuning is None
 
 
@@ -186,7 +186,7 @@ class Ears:
 
     def __post_init__(self) -> None:
         self.room.now = 0
-        self.dongle.request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
+        self.dongle.request(requests.SET_RADIO_MODE, 1, b"", 0)
         self.dongle.sniffer.give = self._take
         if self.reads:
             self.dongle.sniffer.read()
@@ -256,7 +256,7 @@ def test_packets_that_are_not_fetched_wait_and_more_than_eight_are_dropped_and_c
     room.dongles[1].sniffer.read()
     assert [p[2] for p in ears.payloads] == list(range(8))
     for mode in (0, 1):
-        ears.dongle.request(requests.SET_RADIO_MODE, mode, 0, b"", 0)
+        ears.dongle.request(requests.SET_RADIO_MODE, mode, b"", 0)
     assert ears.dongle.sniffer.dropped == 0
 
 
@@ -264,7 +264,7 @@ def test_a_sniffer_hears_its_two_addresses_and_broadcasts_are_not_for_the_ground
     room = Room(THREE, (station(1), station(2)))
     room.tune(0, room.stations[0])
     room.tune(1, room.stations[0])
-    room.dongles[1].request(requests.SET_SNIFFER_ADDRESS, 1, 0, room.stations[1].address, 0)
+    room.dongles[1].request(requests.SET_SNIFFER_ADDRESS, 1, room.stations[1].address, 0)
     ears = Ears(room.dongles[1], room)
     room.exchange(PACKET)
     room.tune(0, room.stations[1])

@@ -44,9 +44,6 @@ class Diary(ChannelObserver):
     def __init__(self, pages: list[str], name: str = "") -> None:
         self.pages, self.name = pages, name
 
-    def slot_published(self, slot: int, data: bytes, time_ns: int) -> None:
-        self.pages.append(f"{self.name}published {slot}")
-
     def all_answered(self, slot: int, answers: Answers) -> None:
         self.pages.append(f"{self.name}answered {slot}")
 
@@ -79,11 +76,11 @@ def test_observers_are_told_in_order_and_closed_once_and_errors_are_named() -> N
     observers = Observers()
     for observer in (Diary(pages, "a"), Failing(None), Diary(pages, "b")):
         observers.add(observer)
-    observers.slot_published(3, b"", 0)
+    observers.all_answered(3, Answers(1, 1))
     with pytest.raises(ObserverError, match="Failing failed: OSError"):
         observers.close()
     observers.close()
-    assert pages == ["apublished 3", "bpublished 3", "aclosed", "bclosed"]
+    assert pages == ["aanswered 3", "banswered 3", "aclosed", "bclosed"]
 
     class Broken(ChannelObserver):
         def agent_silent(self, agent: int) -> None:
@@ -114,9 +111,7 @@ def test_a_channel_needs_no_observer_and_a_slot_is_told_in_order(tmp_path: Path)
             if not observers:
                 host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=3")
     assert pages == [
-        "published 0", "answered 0", "judged 0",
-        "published 1", "over 0", "answered 1", "judged 1",
-        "published 2", "over 1", "answered 2", "closed",
+        "answered 0", "judged 0", "over 0", "answered 1", "judged 1", "over 1", "answered 2", "closed",
     ]  # fmt: skip
 
 

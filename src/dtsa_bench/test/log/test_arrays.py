@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 
 from dtsa_bench.flights.statistics import TimingStatistics
 from dtsa_bench.log.verify.on_air import FramesOnAir
-from dtsa_bench.log.verify.result import Mismatch
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
 MS = 1_000_000
@@ -45,21 +43,14 @@ def equal_again(sent: FramesOnAir) -> bool:
     return all(map(np.array_equal, (received, lost, collided), (sent.received, sent.lost, sent.collided)))
 
 
-@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9))
-@settings(max_examples=40, deadline=None)
-def test_frames_that_wait_for_a_line_begin_and_arrive_when_the_channel_says(frames, loss, seed):
-    verdicts, sent = resolved(ChannelConfig(agents=5, loss=loss, seed=seed, radio="crazyflie"), frames)
-    for v in verdicts:
-        assert (sent.start_ns[v.frame_id], sent.arrival_ns[v.frame_id]) == (v.start_ns, v.arrival_ns)
-
-
 @given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9), st.sampled_from(("plain", "crazyflie")))
 @settings(max_examples=120, deadline=None)
-def test_the_channels_own_verdicts_always_pass(frames, loss, seed, radio):
-    _, sent = resolved(ChannelConfig(agents=5, loss=loss, seed=seed, radio=radio), frames)
-    sent.check_numbers()
-    sent.check_overlaps()
+def test_the_channels_own_verdicts_always_pass_and_frames_arrive_when_it_says(frames, loss, seed, radio):
+    """Radios behind lines make frames wait for each other."""
+    verdicts, sent = resolved(ChannelConfig(agents=5, loss=loss, seed=seed, radio=radio), frames)
     assert equal_again(sent)
+    for v in verdicts:
+        assert (sent.end_ns[v.frame_id], sent.arrival_ns[v.frame_id]) == (v.end_ns, v.arrival_ns)
 
 
 @given(FRAMES, st.integers(0, 99), st.integers(0, 4))
@@ -67,29 +58,7 @@ def test_the_channels_own_verdicts_always_pass(frames, loss, seed, radio):
 def test_one_wrong_receiver_never_passes(frames: list[tuple[int, int, int]], frame: int, receiver: int) -> None:
     _, sent = resolved(ChannelConfig(agents=5), frames)
     sent.received[frame % len(frames), receiver] ^= True
-    with suppress(Mismatch):
-        sent.check_numbers()
-        sent.check_overlaps()
-        assert not equal_again(sent)
-
-
-def test_two_frames_at_one_time_are_never_both_heard() -> None:
-    config, deaf = ChannelConfig(agents=3), [False] * 3
-    sent = sent_frames(config, [(1, 0, 24, deaf, 0, 0), (2, 0, 24, [True, False, True], 0, 0)])
-    with pytest.raises(Mismatch, match="a sender does not hear"):
-        sent.check_overlaps()
     assert not equal_again(sent)
-    length_ns = config.airtime.total_ns(24)
-    with pytest.raises(Mismatch, match="both at cf3"):
-        both_heard(length_ns // 2, second=True).check_overlaps()
-    assert both_heard(length_ns, second=True).check_overlaps() == 0
-    assert both_heard(length_ns // 2, second=False).check_overlaps() == 1
-
-
-def both_heard(gap_ns: int, second: bool) -> FramesOnAir:
-    """A frame of agent 1 and one of agent 2 that starts ``gap_ns`` later; agent 3 has heard both or not."""
-    heard = [(1, 0, 24, [False, False, True], 0, 0), (2, gap_ns, 24, [False, False, second], 0, 0)]
-    return sent_frames(ChannelConfig(agents=3), heard)
 
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:

@@ -14,8 +14,9 @@ from dtsa_agent.air.settings import UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.experiments.sweep import make_sweep
-from dtsa_bench.log.losses import HEARD, LOST, UNKNOWN, fit_links, learn, observe
 from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.arrays import ReceivedFrames
+from dtsa_bench.log.losses import HEARD, LOST, UNKNOWN, fit_links, learn, observe
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merged_bag import write_merged
 from dtsa_bench.log.record import load_log
@@ -155,9 +156,9 @@ def test_agents_over_udp(tmp_path):
     with helpers.flying(config, [udp] * 3, tmp_path) as flying:
         helpers.hear_each_other(flying, 60)
     bags = [read(tmp_path / f"cf{agent}.mcap") for agent in (1, 2, 3)]
-    draw = np.random.default_rng(1)
-    for record in bags[1].slots:
-        record.heard[:] = [one for one in record.heard if one.sender != 1 or draw.random() > 0.4]
+    *arrays, data = bags[1].log.heard
+    kept = np.flatnonzero((arrays[1] != 1) | (np.random.default_rng(1).random(len(data)) > 0.4))
+    bags[1].log.heard = ReceivedFrames(*(values[kept] for values in arrays), [data[k] for k in kept])
     together = Merge(bags)
     result = together.summary()
     write_merged(tmp_path / "whole", together.log, result)

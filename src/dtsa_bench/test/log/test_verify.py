@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
+from bag_helpers import rewrite
 
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.bag.reader import Bag, BagMessage
@@ -29,19 +28,8 @@ KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
 KINDS = ["byte", "drop", "swap times", "swap data"]
 LEASE = ("--agents", "4", "--moving", "2", "--policy", "lease", "--processes", "1", "--timeout-s", "0.5")
 FIELDS = (
-    "data",
-    "length",
-    "received",
-    "lost",
-    "chosen",
-    "reason",
-    "digest",
-    "score",
-    "track",
-    "velocity",
-    "command",
-    "goal",
-)
+    "data", "length", "received", "lost", "chosen", "reason", "digest", "score", "track", "velocity", "command", "goal",
+)  # fmt: skip
 Edit = Callable[[list[BagMessage]], list[BagMessage]]
 
 
@@ -70,35 +58,8 @@ def sealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return fly(tmp_path_factory.mktemp("sealed") / "flight", *LEASE, "--auth")
 
 
-def rewrite(original: Path, copy: Path, edit: Edit, keep_digest: bool = True) -> Path:
-    """A bag with the same header, metadata and indexes but other messages: what a careful forger would write."""
-    with Bag(original / "bag") as bag:
-        messages = edit(list(bag.messages()))
-        source = bag.path
-    with source.open("rb") as stream, copy.open("wb") as target:
-        reader = make_reader(stream)
-        writer = Writer(target, chunk_size=16384)
-        writer.start("ros2", "a forger")
-        for record in reader.iter_metadata():
-            values = record.metadata
-            if not keep_digest:
-                lines = values["serialized_metadata"].splitlines()
-                values["serialized_metadata"] = "\n".join(line for line in lines if "digest:" not in line)
-            writer.add_metadata(record.name, values)
-        summary = reader.get_summary()
-        channels = {}
-        for channel in summary.channels.values():
-            schema = summary.schemas[channel.schema_id]
-            number = writer.register_schema(schema.name, schema.encoding, schema.data)
-            channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number, channel.metadata)
-        for m in messages:
-            writer.add_message(channels[m.topic], m.log_time_ns, m.data, m.publish_time_ns, m.sequence)
-        writer.finish()
-    return copy
-
-
 def test_a_flight_of_real_nodes_is_what_the_protocol_gives(flight: Path, tmp_path: Path) -> None:
-    assert verify_bag(rewrite(flight, tmp_path / "same.mcap", lambda messages: messages)).ok
+    assert verify_bag(rewrite(flight, tmp_path / "same.mcap")).ok
     result = verify_bag(flight)
     assert result.ok, result.difference
     slots = json.loads((flight / "summary.json").read_text())["slots"]["total"]
@@ -230,7 +191,7 @@ def test_a_changed_frame_is_named_and_shown_in_words_without_any_digest(flight, 
 
 
 def result_of(flight: Path, tmp_path: Path, edit: Edit) -> Result:
-    return verify_bag(rewrite(flight, tmp_path / "edited.mcap", edit, keep_digest=False))
+    return verify_bag(rewrite(flight, tmp_path / "edited.mcap", edit, without="digest:"))
 
 
 @pytest.mark.parametrize("topic", [SLOT_RECORD, "/swarm/markers", "/cf3/odom"])

@@ -167,7 +167,7 @@ def test_untouched_bags_pass_also_those_from_before_radios_had_names(flown: Path
     assert "motion" in result.skipped
     with Bag(flown / "bag") as bag:
         sent = sum(len(record.sender) for _, record in bag.typed([SLOT_RECORD]))
-    assert result.checked["frames that no agent heard together with another"] == sent
+    assert result.checked["verdicts made again"] == sent
     with Bag(flown / "bag") as bag:
         channel = {name: value for name, value in bag.config["channel"].items() if name != "radio"}
     result = rewritten(flown, tmp_path / "old", untouched, channel=channel)

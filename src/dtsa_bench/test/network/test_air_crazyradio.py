@@ -18,9 +18,10 @@ from waiting import wait_for
 pytest.importorskip("usb")
 
 from dtsa_agent.air.crazyradio_port import broadcast, datagram_in
-from dtsa_agent.air.port import link_of
+from dtsa_agent.air.port import frame_in, link_of
 from dtsa_agent.air.settings import CrazyradioSettings
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.core.station import StationSettings
 from dtsa_agent.keys import authenticator
 from dtsa_bench.commands.cli import main
@@ -119,15 +120,20 @@ def test_a_computer_reads_what_the_app_on_board_says(auth: bool, tmp_path: Path)
     heard = CrazyradioSettings(uri="radio://0/80/2M")
     assert port == heard.p2p_port
     datagrams = StationSettings(swarm, link_of(swarm, heard.properties), authenticator(swarm))
-    said = [record for k in (1, 2, 3) for record in read(tmp_path / f"cf{k}.mcap").slots if record.datagram]
+    logs = [read(tmp_path / f"cf{k}.mcap").log for k in (1, 2, 3)]
+    said = [
+        (log.first_slot + row, data)
+        for log in logs
+        for row, data in zip(log.sent_frames.row.tolist(), log.sent_frames.data, strict=True)
+    ]
     assert len(said) > 100
-    for record in said:
-        datagram = datagram_in(broadcast(record.datagram, heard.p2p_port)[5:], heard.p2p_port)
+    for slot, sent in said:
+        datagram = datagram_in(broadcast(sent, heard.p2p_port)[5:], heard.p2p_port)
         assert datagram is not None
         told = datagrams.read(datagram)
-        assert (told.fault, told.slot, told.frame) == ("", record.slot, record.frame)
-    last = said[-1]
-    assert datagrams.write(last.frame, last.slot, told.late_ns) == last.datagram
+        frame = frame_in(sent, swarm)
+        assert (told.fault, told.slot, told.frame) == ("", slot, frame[: len(frame) - (TAG_LENGTH if auth else 0)])
+    assert datagrams.write(told.frame, told.slot, told.late_ns) == said[-1][1]
 
 
 def test_a_dongle_that_goes_and_is_back_is_said_and_flies_on(tmp_path: Path) -> None:

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.air.port import NETWORK
 from dtsa_agent.air.record import SlotRecord
-from dtsa_agent.air.settings import UdpSettings
+from dtsa_agent.air.settings import AgentSettings, UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
-from dtsa_bench.log.agent_bag import AgentBag, NothingWritten, read
+from dtsa_bench.log.agent_bag import AgentBag, AgentRecorder, NothingWritten, read
+from dtsa_bench.log.arrays import split_log
 from dtsa_bench.log.merge.merge import Merge
-from dtsa_bench.log.merge.timeline import Crossing, Process, both_ways, fit
+from dtsa_bench.log.merge.timeline import Crossings, both_ways, fit
 from dtsa_bench.log.merged_flight import count_unmatched_frames, slots_until_all_known
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
@@ -105,8 +105,7 @@ def test_an_agent_that_wrote_nothing_is_named_and_the_others_are_merged(bags, tm
 def test_frames_of_a_process_that_wrote_nothing_are_no_lies(bags, tmp_path, capsys):
     """cf2 was killed before it wrote, and its frames were heard; then it came back, and was heard, too."""
     later = read(bags[1])
-    middle = later.slots[len(later.slots) // 2].slot
-    later.slots = [record for record in later.slots if record.slot >= middle]
+    later.log = split_log(later.log, later.log.first_slot + len(later.log) // 2)
     assert Merge([read(bags[0]), later]).summary()["frames_heard_not_as_sent"] > 0
     assert Merge([read(bags[0]), later], ["runs/cf2"]).summary()["frames_heard_not_as_sent"] == 0
 
@@ -114,8 +113,7 @@ def test_frames_of_a_process_that_wrote_nothing_are_no_lies(bags, tmp_path, caps
 def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: list[Path]) -> None:
     """It holds only the time of all: what cf2 sent before it took that over is heard, and not known as sent."""
     later = read(bags[1])
-    middle = later.slots[len(later.slots) // 2].slot
-    later.slots = [record for record in later.slots if record.slot >= middle]
+    later.log = split_log(later.log, later.log.first_slot + len(later.log) // 2)
     log = Merge([read(bags[0]), later]).log
     assert count_unmatched_frames(log) > 0
     for agents, is_right in (([2], True), ([1], False)):
@@ -126,12 +124,11 @@ def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: 
 def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:
     ones = [read(path) for path in bags[:2]]
     before = Merge(ones).summary()["flight"]
-    first, last = ones[1].slots[0].slot, ones[1].slots[-1].slot
+    log = ones[1].log
+    first, last = log.first_slot, log.first_slot + len(log) - 1
     since = first + (last - first) // 2
     assert last - since > 2 * slots_until_all_known(CONFIG)
-    for record in ones[1].slots:  # cf2 heard nothing in the second half
-        if record.slot >= since:
-            record.heard = []
+    log.heard = log.heard.part(0, since - first)  # cf2 heard nothing in the second half
     after = Merge(ones).summary()["flight"]
     assert before["heard_age_max_slots"] < after["heard_age_max_slots"] <= last - since + before["heard_age_max_slots"]
     assert after["heard_age_max_slots"] > (last - since) * 0.8
@@ -141,57 +138,58 @@ def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:
     assert 0.5 < after["pairs_known_share"] < 1.0
 
 
-def _crossings(delays_ns: dict[tuple[int, int], int], frames: int = 400) -> list[Crossing]:
+PROCESSES = [(agent, 0) for agent in range(6)]
+
+
+def _crossings(delays_ns: dict[tuple[int, int], int], frames: int = 400) -> Crossings:
     """Frames among agents whose clocks are one and the same."""
     draw = np.random.default_rng(5)
-    return [
-        Crossing((sender, 0), (receiver, 0), at * 10 * MS, at * 10 * MS + under_way + int(draw.normal(0, 5_000)))
+    rows = [
+        (sender, receiver, at * 10 * MS, at * 10 * MS + under_way + int(draw.normal(0, 5_000)))
         for at in range(frames)
         for (sender, receiver), under_way in delays_ns.items()
     ]
-
-
-def _names(groups: list[tuple[Process, ...]]) -> list[tuple[int, ...]]:
-    return [tuple(agent for agent, _ in group) for group in groups]
+    return Crossings(*np.array(rows, np.int64).reshape(-1, 4).T)
 
 
 def test_clocks_are_fit_within_groups_connected_both_ways() -> None:
     """Frames from cf1 and cf2 to cf3 and cf4 take 100 ms; back there are none."""
     slow = {(sender, receiver): 100 * MS for sender in (1, 2) for receiver in (3, 4)}
     near = dict.fromkeys([(1, 2), (2, 1), (3, 4), (4, 3)], 184_000)
-    line = fit(_crossings(near | slow), 30_000)
-    assert _names(list(line.groups)) == [(1, 2), (3, 4)]
+    line = fit(PROCESSES, _crossings(near | slow), 30_000)
+    assert list(line.groups) == [((1, 0), (2, 0)), ((3, 0), (4, 0))]
     assert line.clocks.keys() == {(1, 0), (2, 0)}
     assert line.flight_ns == pytest.approx(184_000, abs=2_000)
-    lone = fit(_crossings({(1, 2): 100 * MS}), 30_000)
+    lone = fit(PROCESSES, _crossings({(1, 2): 100 * MS}), 30_000)
     assert (dict(lone.clocks), lone.summary()["flight_time_us"]) == ({}, None)
     ring = {(1, 2): MS, (2, 3): MS, (3, 1): MS}
-    assert _names(both_ways(_crossings(ring, 3))) == [(1, 2, 3)]
-    line = fit(_crossings(ring), 30_000)
+    assert both_ways(6, _crossings(ring, 3)) == [(1, 2, 3)]
+    line = fit(PROCESSES, _crossings(ring), 30_000)
     assert line.flight_ns == pytest.approx(MS, abs=5_000)
     assert all(abs(clock.offset_ns + clock.coarse_ns - line.clocks[(1, 0)].coarse_ns) < 5_000
                for clock in line.clocks.values())  # fmt: skip
-    assert _names(both_ways(_crossings(ring | {(4, 1): MS, (4, 5): MS, (5, 4): MS}, 3))) == [(1, 2, 3), (4, 5)]
-    assert both_ways([]) == []
+    assert both_ways(6, _crossings(ring | {(4, 1): MS, (4, 5): MS, (5, 4): MS}, 3)) == [(1, 2, 3), (4, 5)]
+    assert both_ways(6, _crossings({})) == []
     many = _crossings({(1, 2): MS}, 90_001)
-    back = Crossing((2, 0), (1, 0), 5 * MS, 6 * MS)
-    line = fit([*many[:7], back, *many[7:]], 30_000)
+    back = np.array([2, 1, 5 * MS, 6 * MS])
+    line = fit(PROCESSES, Crossings(*np.insert(np.array(many), 7, back, axis=1)), 30_000)
     assert line.clocks.keys() == {(1, 0), (2, 0)}
     assert line.flight_ns == pytest.approx(MS, abs=50_000)
 
 
-def test_slots_of_times_that_were_given_up_are_kept_apart() -> None:
+def test_slots_of_times_that_were_given_up_are_kept_apart(tmp_path: Path) -> None:
     """Two processes of an agent, each of which took over a time with smaller slot numbers."""
-    zero = np.zeros(3)
+    zero, track = np.zeros(3), np.zeros((CONFIG.steps, 3))
 
-    def process(slots: list[int]) -> AgentBag:
-        records = [
-            SlotRecord(slot, 0, 0, at == 0, 1, 0, 0, 0, 0.0, np.zeros((1, 3)), zero, zero, zero)
-            for at, slot in enumerate(slots)
-        ]
-        return AgentBag(Path("cf1.mcap"), 1, CONFIG, NETWORK, 0, records)
+    def process(name: str, slots: list[int]) -> AgentBag:
+        with AgentRecorder(tmp_path / name, AgentSettings(id=1), CONFIG, UdpSettings(interface="lo")) as recorder:
+            for at, slot in enumerate(slots):
+                is_first = at == 0 or slot < slots[at - 1]
+                recorder.slot(SlotRecord(slot, 0, 0, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
+        return read(tmp_path / name)
 
-    processes = Merge([process([70, 71, 3, 4]), process([90, 91, 80, 5, 6])]).processes
-    assert {process: [record.slot for record in bag.slots] for process, bag in processes.items()} == {
+    bags = [process("a.mcap", [70, 71, 3, 4]), process("b.mcap", [90, 91, 80, 5, 6])]
+    slots = {key: np.flatnonzero(bag.log.known) + bag.log.first_slot for key, bag in Merge(bags).processes.items()}
+    assert {key: values.tolist() for key, values in slots.items()} == {
         (1, 0): [3, 4], (1, 1): [5, 6], (1, -1): [70, 71], (1, -2): [80], (1, -3): [90, 91],
     }  # fmt: skip

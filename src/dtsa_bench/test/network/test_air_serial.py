@@ -206,4 +206,4 @@ def test_bytes_of_mavlink_are_told_and_the_bag_is_whole(tmp_path: Path) -> None:
         helpers.go_on([one], 10)
     bag = read(tmp_path / "cf1.mcap")
     assert not bag.broken_off
-    assert len(bag.slots) > 10
+    assert len(bag.log) > 10

@@ -30,7 +30,7 @@ from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.merge.merge import Merge, is_verified
-from dtsa_bench.log.merge.timeline import Crossing, fit
+from dtsa_bench.log.merge.timeline import Crossings, fit
 from dtsa_bench.log.merged_bag import write_merged
 from dtsa_bench.log.record import SLOT_RECORD, load_log
 from dtsa_bench.log.verify.check import verify_bag
@@ -131,7 +131,7 @@ def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
     def numbers(text: str, kind: str) -> Any:
         return np.frombuffer(base64.b64decode(text), kind)
 
-    records = {agent: {r.slot: r for r in read(path).slots} for agent, path in enumerate(flight.bags, 1)}
+    records = {agent: read(path).log for agent, path in enumerate(flight.bags, 1)}
     heard = [
         pair
         for moment in flight.told
@@ -142,7 +142,9 @@ def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
         )
     ]
     assert len(heard) > 60
-    sent = {(slot, agent) for agent, found in records.items() for slot, r in found.items() if r.sent_ns >= 0}
+    sent = {
+        (log.first_slot + row, agent) for agent, log in records.items() for row in np.flatnonzero(log.sent).tolist()
+    }
     assert set(heard) <= sent
     assert len(set(heard)) == len(heard)
     first = heard[0][0]
@@ -151,7 +153,8 @@ def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
     slot = numbers(middle["at"], "<u4")[-1]
     place = numbers(middle["place"], "<f4").reshape(-1, 3, CONFIG.agents)[-1]
     for agent in (1, 2, 3):
-        assert np.linalg.norm(place[:, agent - 1] - records[agent][slot].track[-1]) < 0.1
+        track = records[agent].track[slot - records[agent].first_slot, -1, :, 0]
+        assert np.linalg.norm(place[:, agent - 1] - track) < 0.1
     words = "\n".join(event[2] for moment in flight.told for event in moment["events"])
     assert all(f"cf{agent} is heard" in words and f"cf{agent} leaves" in words for agent in (1, 2, 3))
     assert "cf4" not in words
@@ -162,16 +165,18 @@ def test_a_page_is_told_what_a_listener_heard(flight: SimpleNamespace) -> None:
 
 def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespace, tmp_path: Path) -> None:
     bags = [read(path) for path in flight.bags]
-    said = bags[0].slots[-20]
-    said.chosen = 4 if said.chosen != 4 else 1
+    log = bags[0].log
+    row = int(np.flatnonzero(log.known)[-20])
+    log.chosen[row] = 4 if log.chosen[row, 0] != 4 else 1
     found = Merge(bags).summary()
     assert not is_verified(found)
     assert [(one["agent"], one["slot"], one["field"]) for one in found["decisions_again"]["differences"]] == [
-        (1, said.slot, "chosen")
+        (1, log.first_slot + row, "chosen")
     ]
     bags = [read(path) for path in flight.bags]
-    spoken = next(record for record in bags[1].slots[-60:] if record.datagram)
-    spoken.datagram = spoken.datagram[:-5] + bytes([spoken.datagram[-5] ^ 1]) + spoken.datagram[-4:]
+    frames = bags[1].log.sent_frames
+    at = np.flatnonzero(frames.row > len(bags[1].log) - 60)[0]
+    frames.data[at] = frames.data[at][:-5] + bytes([frames.data[at][-5] ^ 1]) + frames.data[at][-4:]
     assert Merge(bags).summary()["frames_heard_not_as_sent"] > 0
     for number, name in enumerate(("chosen", "digest", "lost", "received", "data", "odom")):
         with Bag(flight.whole) as bag, BagWriter(tmp_path / f"{number}", None, custom_data=bag.custom_data) as copy:
@@ -206,12 +211,13 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Pa
     cut.write_bytes(whole[: len(whole) * 2 // 3])
     bag = read(cut)
     assert bag.broken_off
-    assert 0 < len(bag.slots) < len(read(flight.bags[0]).slots)
+    assert 0 < len(bag.log) < len(read(flight.bags[0]).log)
     found = Merge([bag, *(read(path) for path in flight.bags[1:])]).summary()
     assert found["broken_off"] == ["cf1"]
     assert is_verified(found)
     saved = read(recover(cut).directory)
-    assert [record.slot for record in saved.slots] == [record.slot for record in bag.slots]
+    assert saved.log.known.tolist() == bag.log.known.tolist()
+    assert saved.log.first_slot == bag.log.first_slot
     again = Merge([saved, *(read(path) for path in flight.bags[1:])]).summary()
     assert {**again, "broken_off": []} == {**found, "broken_off": []}, again
     assert again["broken_off"] == ["cf1"]
@@ -309,8 +315,8 @@ def test_bags_that_do_not_belong_together_are_refused(flight: SimpleNamespace) -
     with pytest.raises(ConfigError, match="bags"):
         Merge([]).summary()
     deaf = read(flight.bags[1])
-    for record in (*one.slots, *deaf.slots):
-        record.before, record.heard = [], []
+    for bag in (one, deaf):
+        bag.log.heard = bag.log.heard.part(0, 0)
     apart = Merge([one, deaf])
     with pytest.raises(ConfigError, match=r"hear each other|do not go both ways"):
         _ = apart.log
@@ -323,20 +329,18 @@ def test_offsets_and_drifts_are_found_among_frames_that_were_held_up() -> None:
     def shown(agent: int, at_ns: float) -> int:
         return round(offset[agent] + at_ns * (1 + drift[agent]))
 
-    crossings = []
+    rows = []
     for at in range(0, 20_000_000_000, 10_000_000):
         sender = int(draw.integers(1, 4))
         for receiver in {1, 2, 3} - {sender}:
             under_way = 250_000 + draw.normal(0, 5_000) + (draw.random() < 0.1) * 4_000_000
-            crossings.append(
-                Crossing((sender, 0), (receiver, 0), shown(sender, at + 10**9), shown(receiver, at + 10**9 + under_way))
-            )
-    line = fit(crossings, 30_000)
+            rows.append((sender, receiver, shown(sender, at + 10**9), shown(receiver, at + 10**9 + under_way)))
+    line = fit([(agent, 0) for agent in range(4)], Crossings(*np.array(rows).T), 30_000)
     found = line.summary()
     assert found["clocks"]["cf2"]["drift_ppm"] - found["clocks"]["cf1"]["drift_ppm"] == pytest.approx(60, abs=0.2)
     assert found["clocks"]["cf3"]["drift_ppm"] == pytest.approx(-40, abs=0.2)
     assert found["flight_time_us"] == pytest.approx(250, abs=2)
-    assert found["frames_left_out"] == pytest.approx(len(crossings) / 10, rel=0.2)
+    assert found["frames_left_out"] == pytest.approx(len(rows) / 10, rel=0.2)
     at = 10**10
     here = [line.clocks[(agent, 0)].common_ns(shown(agent, at)) for agent in (1, 2, 3)]
     assert max(here) - min(here) < 3_000

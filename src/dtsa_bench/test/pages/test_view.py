@@ -18,9 +18,8 @@ pytest.importorskip("aiohttp")
 import aiohttp
 from browser_helpers import serving
 
-from dtsa_agent.core import Swarm, SwarmConfig
+from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.log.knowledge import observed
 from dtsa_bench.log.record import load_log
 from dtsa_bench.pages.view.history import (
     MAX_BYTES,
@@ -29,10 +28,12 @@ from dtsa_bench.pages.view.history import (
     UNKNOWN,
     Moment,
     MomentBuilder,
+    PageCommand,
     RunHistory,
+    parse_command,
 )
-from dtsa_bench.pages.view.page_commands import PageCommand, parse_command
 from dtsa_bench.pages.view.server import ViewServer, _PageStream
+from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim.model.verdict import SUCCESS
 
 
@@ -70,18 +71,17 @@ def test_ages_and_beliefs_are_those_of_the_report(bag: Path, history: RunHistory
     run = load_log(bag)
     ages = run.knowledge.ages
     assert ages is not None
-    by_slot = {one.slot: one for one in observed(run)}
+    table = run.ages_by_observer
     _, moments = history.since(0, MAX_MOMENTS)
     for moment in moments[3:]:
         told = numbers(json.loads(moment.text)["age"], "<u2")
         known = ages.age[moment.slot - 1]
         assert (told == UNKNOWN).tolist() == np.isnan(known).tolist()
         assert np.nanmax(np.abs(np.where(told == UNKNOWN, np.nan, told) / 10 - known)) <= 0.051
-        one = by_slot[moment.slot - 1]
         for observer in (1, AGENTS):
             heard = np.frombuffer(moment.belief(observer, AGENTS)[0], "<u2")
-            for agent, age in zip(one.agent[one.observer == observer], one.age[one.observer == observer], strict=True):
-                assert heard[agent - 1] == age
+            rows = table[(table.slot == moment.slot - 1) & (table.observer == observer)]
+            assert heard[rows.agent - 1].tolist() == rows.age_slots.tolist()
 
 
 def test_a_history_and_what_waits_for_a_page_are_limited() -> None:
@@ -97,15 +97,15 @@ def test_a_history_and_what_waits_for_a_page_are_limited() -> None:
     first, moments = history.since(0, 100)
     assert len(moments) <= 4
     assert moments[-1].slot == 4
-    swarm = Swarm(SwarmConfig(agents=AGENTS))
-    builder, reason = MomentBuilder(swarm.scenario), np.zeros(AGENTS, np.uint8)
+    run, reason = RunConfig(SwarmConfig(agents=AGENTS)), np.zeros(AGENTS, np.uint8)
+    builder = MomentBuilder(history, run, make_scenario(run.swarm), {})
     for slot in range(5 * MAX_FRAMES // 2):
         builder.add_frames(slot, SUCCESS, (slot % AGENTS + 1,), reason, None)
-    slots = [
-        numbers(json.loads(builder.build(slot, None, swarm.chosen, None).text)["frames"]["slot"], "<u4") for _ in "ab"
-    ]
-    assert slots[0].tolist() == list(range(slot - MAX_FRAMES + 1, slot + 1))
-    assert not len(slots[1])
+    for _ in "ab":
+        builder.append_moment(slot, None, np.zeros(AGENTS, np.uint16), None)
+    frames = [json.loads(moment.text)["frames"]["slot"] for moment in history.since(0, 5)[1]]
+    assert numbers(frames[0], "<u4").tolist() == list(range(slot - MAX_FRAMES + 1, slot + 1))
+    assert not frames[1]
 
 
 async def _statuses(url: str) -> dict[str, int]:

@@ -20,8 +20,7 @@ from view_helpers import AGENTS, PATIENCE_S, history_of, lossy_bag, numbers, on_
 from waiting import wait_for
 
 from dtsa_bench.log.record import load_log
-from dtsa_bench.pages.view.history import MAX_MOMENTS, Moment, RunHistory, VehicleStates
-from dtsa_bench.pages.view.page_commands import PageCommand
+from dtsa_bench.pages.view.history import MAX_MOMENTS, Moment, PageCommand, RunHistory, VehicleStates
 from dtsa_bench.pages.view.server import ViewServer
 
 FIGURES = """(() => ({

@@ -17,7 +17,6 @@ from dtsa_agent.core.errors import LocalProtocolError
 from .airtime import Airtime
 from .config import ChannelConfig
 from .losses import Losses, NoiseSource
-from .topology import group_numbers, squared_distances
 
 Mask = NDArray[np.bool_]
 Positions = NDArray[np.float64]
@@ -74,13 +73,15 @@ class Medium:
         self._capture = 10.0 ** (config.capture_db / 10.0) if config.capture_db else 0.0
         self._exponent = config.path_loss_exponent
         self._jam = config.jam
-        self._groups = group_numbers(config.groups, config.agents) if config.groups else None
+        self._groups = np.zeros(config.agents, dtype=np.int32)  # number of each agent's
+        for number, group in enumerate(config.groups):
+            self._groups[np.asarray(group) - 1] = number
         #: Which receivers lose a frame to noise.
         self.losses = Losses(config, source or NoiseSource(config.seed, config.agents))
         self.needs_positions = config.needs_positions
         #: True when everybody hears and disturbs everybody: two frames at one time destroy each other
         #: everywhere.
-        self.everywhere = not self.needs_positions and self._groups is None
+        self.everywhere = not self.needs_positions and not config.groups
 
     def resolve(
         self, slot: int, frame: OnAir, others: Sequence[OnAir], positions: Positions | None = None
@@ -138,14 +139,12 @@ class Medium:
 
     def _strength_of(self, sender: int, positions: Positions | None, range2: float) -> tuple[Mask, NDArray[np.float64]]:
         """Return who is near enough to a sender, (N,), and the power there, relative to that at 1 m (with capture)."""
-        heard = np.ones(self._agents, dtype=np.bool_)
-        power = _NO_POWER
-        if self._groups is not None:
-            heard &= self._groups == self._groups[sender - 1]
+        heard, power = self._groups == self._groups[sender - 1], _NO_POWER
         if self.needs_positions:
             if positions is None:
                 raise LocalProtocolError("a limited range and capture need the agents' positions")
-            distance2 = squared_distances(positions, sender)
+            offset = positions - positions[:, sender - 1 : sender]
+            distance2 = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2
             if range2:
                 heard &= distance2 <= range2
             if self._capture:

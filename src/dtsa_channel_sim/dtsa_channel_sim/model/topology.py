@@ -1,4 +1,4 @@
-"""Which agents are connected: groups of a partition, losses of links, distances; and how settings say so."""
+"""Which agents are connected: groups of a partition, losses of links; and how settings say so."""
 
 from __future__ import annotations
 
@@ -66,14 +66,6 @@ def parse_partition(value: object, agents: int, name: str = "partition") -> Grou
     if rest:
         groups.append(rest)
     return tuple(groups) if len(groups) > 1 else ()
-
-
-def group_numbers(groups: Groups, agents: int) -> NDArray[np.int32]:
-    """Return the number of each agent's group, (N,), zeros without a partition."""
-    numbers = np.zeros(agents, dtype=np.int32)
-    for number, group in enumerate(groups):
-        numbers[np.asarray(group) - 1] = number
-    return numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,9 +137,3 @@ def link_matrix(matrix: Matrix, links: Sequence[LinkLoss], agents: int) -> NDArr
             result[np.ix_(receivers, senders)] = link.loss
     np.fill_diagonal(result, 0.0)
     return result if result.any() else None
-
-
-def squared_distances(positions: NDArray[np.float64], agent: int) -> NDArray[np.float64]:
-    """Return the squared distance of every agent to one, (N,), m^2; positions (3, N), m, frame map."""
-    offset = positions - positions[:, agent - 1 : agent]
-    return np.asarray(offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2)

@@ -132,9 +132,11 @@ class Relay:
     # Where robots are.
 
     def _follow(self, type_name: str, topic: str, accept: Callable[[Any], None]) -> None:
-        qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        if topic == "/tf_static":
+        qos = QoSProfile(depth=_DEPTH)
+        if topic == "/tf_static":  # of a publisher that may have spoken before
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        elif topic != "/tf":
+            qos.reliability = ReliabilityPolicy.BEST_EFFORT
         self._feeds.append((Feed(self._node, message_class(type_name), topic, qos, intake=self._intake), accept))
 
     def _accept_odometry(self, row: int, message: Any) -> None:
@@ -217,10 +219,10 @@ class Relay:
         ]
         for sender, receiver in np.argwhere(counts["sent"]).tolist():
             values = {name: counts[name][sender, receiver] for name in COUNTS}
-            newest_ns = self._transport.newest_ns[receiver, sender]
+            newest = self._transport.newest[receiver, sender]
             delay_ms = counts["delay_ns"][sender, receiver] / max(1, values["received"]) / 1e6
             values["delay_mean_ms"] = f"{delay_ms:.3f}"
-            values["age_ms"] = f"{(self._now_ns - newest_ns) / 1e6:.3f}" if newest_ns >= 0 else "-1"
+            values["age_ms"] = f"{(self._now_ns - newest.at_ns) / 1e6:.3f}" if newest else "-1"
             name = f"relay: {self._names[sender]} to {self._names[receiver]}"
             rows.append((name, f"{values['received']} of {values['sent']} received", values))
         message = DiagnosticArray()

@@ -76,7 +76,8 @@ class Transport:
     def __init__(self, config: MessageChannel) -> None:
         agents, self.config = config.agents, config
         self.counts = {name: np.zeros((agents, agents), np.int64) for name in (*COUNTS, "delay_ns")}  # delay: sum
-        self.newest_ns = np.full((agents, agents), -1)  # [receiver, sender]: when its newest message was sent; -1: none
+        self.newest = np.full((agents, agents), None)  # [receiver, sender]: the last message that has come; None: none
+        self._heard_ns = np.full(agents, -1)  # when the newest message of each was sent that any agent received
         # Noise is drawn by messages, not by slots.
         channel = Channel(replace(config, loss=0.0, burst_length=0.0, link_loss=(), loss_matrix=(), losses=""))
         self._medium, self._airtime = channel.medium(0), config.airtime.of_messages(config.longest)
@@ -129,7 +130,10 @@ class Transport:
         else:
             self._run_radios(until_ns)
         self._resolve(until_ns)
-        return self._arriving.pop(until_ns)
+        arrived = self._arriving.pop(until_ns)
+        for message, received in arrived:
+            self.newest[received, message.sender - 1] = message
+        return arrived
 
     @property
     def due_ns(self) -> int:
@@ -164,7 +168,7 @@ class Transport:
         if self.config.access == "tdma":
             return (slot % agents,) if ready[slot % agents] else ()
         # A coordinator that knows what was received: the agent that has been silent for longest, or has moved farthest.
-        urgency = now_ns - self.newest_ns.max(axis=0)
+        urgency = now_ns - self._heard_ns
         if self.config.access == "error" and self._positions is not None:
             urgency = np.linalg.norm(np.nan_to_num(self._positions) - self._sent_positions, axis=0)
         return (int(np.where(ready, urgency, -np.inf).argmax()),) if any(ready) else ()
@@ -232,7 +236,7 @@ class Transport:
         ):  # fmt: skip
             self.counts[name][row] += values
         if received.any():
-            self.newest_ns[received, row] = np.maximum(self.newest_ns[received, row], message.at_ns)
+            self._heard_ns[row] = max(self._heard_ns[row], message.at_ns)
             self._arriving.add(arrival_ns, (message, received))
         return clear & ~noise
 

@@ -79,7 +79,7 @@ def watch(channel: RosChannel, node: Node, settings: Mapping[str, Any], space: s
     channel.observe(
         RunLog(node, channel.run_id, isinstance(channel, LockstepChannel)),
         RunTopics(node, settings, channel.run_id, channel.slot_ns, space),
-        Diagnostics(node, channel.slot_ns),
+        Diagnostics(node, channel),
     )
     try:
         channel.observe(Transforms(node, channel.agents, channel.slot_ns, space))

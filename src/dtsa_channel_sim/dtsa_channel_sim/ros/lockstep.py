@@ -77,7 +77,6 @@ class LockstepChannel(RosChannel):
         self.slot, self._complaint = slot, ""
         self._publisher.publish(self._bytes)
         self._publish_clock(time_ns)
-        self._observers.slot_published(slot, self._bytes, time_ns)
 
     def _collect(self, slot: int, stop: object) -> bool:
         """Collect answers until all agents have given theirs; return False when stopped."""

@@ -28,7 +28,6 @@ class ChannelStatus:
     """How the channel is doing."""
 
     slot: int  # the last one opened (lockstep) or closed (real time); -1: none yet
-    dropped: dict[str, int]  # messages and frames that were not received, by reason
     awaited: list[int]  # ids of the agents whose answers are missing
 
 
@@ -36,12 +35,8 @@ class ChannelObserver:
     """Events of a run. An observer derives from this class and overrides those that it needs; the rest costs nothing.
 
     Observers are called in the order in which they were added. None of them can change what happens on the air. A slot
-    passes in this order: ``slot_published``, ``all_answered``, ``arbitrated``, ``slot_over``. Answers are valid during
-    the call. Slot messages are CDR, their times ns of simulated time.
+    passes in this order: ``all_answered``, ``arbitrated``, ``slot_over``. Answers are valid during the call.
     """
-
-    def slot_published(self, slot: int, data: bytes, time_ns: int) -> None:
-        """A slot message has been sent, which opens this slot or delivers its frame."""
 
     def frame_sent(self, slot: int, sender: int, data: bytes, start_ns: int) -> None:
         """A frame goes on the air, in real time only: slot that its sender counts, start from that of slot 0."""
@@ -51,9 +46,6 @@ class ChannelObserver:
 
     def start_known(self, at_s: float) -> None:
         """It is known when slot 0 starts, s of ``time.monotonic()``, in real time only."""
-
-    def stalled(self, from_ns: int, to_ns: int) -> None:
-        """The channel stood still, in real time only; ns from the start of slot 0."""
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         """All connected agents have answered a slot, with the true motion during the slot before."""

@@ -289,7 +289,6 @@ class RealtimeChannel(RosChannel):
         self._deliver_arrived(now)
         self._recovered_ns = now + (_RECOVERY_NS if now - before > self._patience_ns else self._patience_ns)
         self._attendance.excuse(now - before, self._recovered_ns)
-        self._observers.stalled(before, now)
 
     def _falls_behind(self, now: int) -> bool:
         """Whether the run cannot keep up, by its accounts or by the agents' reports."""
@@ -339,10 +338,8 @@ class RealtimeChannel(RosChannel):
                 continue
             frame = self.air.frames[verdict.frame_id]
             time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
-            data = self._pack_slot(time_ns, slot, slot, (sender,), (frame,), verdict.received[None])
-            self._publisher.publish(data)
+            self._publisher.publish(self._pack_slot(time_ns, slot, slot, (sender,), (frame,), verdict.received[None]))
             self.accounts.deliver(slot, sender, frame, verdict.arrival_ns, verdict.received)
-            self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
 
     # The accounts.
 

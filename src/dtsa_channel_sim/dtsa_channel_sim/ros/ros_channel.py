@@ -260,7 +260,7 @@ class RosChannel:
             self._clock_watched = self._clock.get_subscription_count() > 0
             self._meet_processes()
             awaited = self.answers.silent if self.roster.closed else self.roster.missing
-            self._observers.idle(ChannelStatus(self.slot, self.dropped(), awaited))
+            self._observers.idle(ChannelStatus(self.slot, awaited))
 
     def _goes_on(self, slot: int, answers: Answers) -> bool:
         """All agents have answered a slot; return whether the run goes on."""

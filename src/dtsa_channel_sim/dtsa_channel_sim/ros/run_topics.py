@@ -11,17 +11,17 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from dtsa_msgs.msg import Configuration, RunStatus
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
-from std_msgs.msg import Header
 
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.messages import header_of, time_of
+from dtsa_agent.ros.common.messages import header_of
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_agent.ros.common.runs import WaitingLog
 from dtsa_channel_sim.model.schedule import Change
-from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
+from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Answers
 from .observer import ChannelObserver, ChannelStatus
+from .ros_channel import RosChannel
 
 _STATUS_S = 1.0  # wall time from one status to the next while nothing changes
 _TRANSFORMS_S = 0.02  # wall time from one message of transforms to the next at the least
@@ -110,38 +110,27 @@ class RunTopics(ChannelObserver):
 
 
 class Diagnostics(ChannelObserver):
-    """Publishes the channel's status on ``/diagnostics`` once a second of wall time, while somebody subscribes."""
+    """Publishes on ``/diagnostics`` once a second of wall time, while somebody subscribes, what was not received."""
 
-    def __init__(self, node: Node, slot_ns: int) -> None:
-        self._slot_ns = slot_ns
-        self._name = f"{node.get_namespace().strip('/')}: channel"
-        self._counts = dict.fromkeys(OUTCOMES, 0)  # slots by outcome
+    def __init__(self, node: Node, channel: RosChannel) -> None:
+        self._name, self._channel = f"{node.get_namespace().strip('/')}: channel", channel
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._ticks = 0
-
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        self._counts[OUTCOMES[verdict.outcome]] += 1
 
     def idle(self, status: ChannelStatus) -> None:
         self._ticks += 1
         if self._ticks % 10 or not self._publisher.get_subscription_count():
             return
-        values = {
-            "slot": status.slot,
-            "not taken in": sum(status.dropped.values()),
-            "agents awaited": status.awaited,
-            **{f"not taken in: {reason}": count for reason, count in sorted(status.dropped.items())},
-            **{f"slots: {name}": count for name, count in self._counts.items()},
-        }
+        dropped = self._channel.dropped()
+        values = {"agents awaited": status.awaited, "not taken in": sum(dropped.values())}
+        values |= {f"not taken in: {reason}": count for reason, count in sorted(dropped.items())}
         message = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if status.dropped else DiagnosticStatus.OK,
-            name=self._name,
-            message=f"slot {status.slot}",
-            hardware_id="simulated",
+            level=DiagnosticStatus.WARN if dropped else DiagnosticStatus.OK,
+            name=self._name, message=f"slot {status.slot}", hardware_id="simulated",
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
-        stamp = time_of(names.slot_time_ns(max(0, status.slot), self._slot_ns))
-        self._publisher.publish(DiagnosticArray(header=Header(stamp=stamp), status=[message]))
+        )  # fmt: skip
+        header = header_of(names.slot_time_ns(max(0, status.slot), self._channel.slot_ns))
+        self._publisher.publish(DiagnosticArray(header=header, status=[message]))
 
 
 class Transforms(ChannelObserver):

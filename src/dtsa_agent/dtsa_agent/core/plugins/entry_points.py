@@ -124,6 +124,7 @@ class PluginSwarm(Swarm):
         self._genie = self._make_part(POLICIES, 0) if has_genie else None
         #: Plug-ins of each observer; empty if the part is built in, or the policy is a genie.
         self.policies, self.estimators, self.avoiders = (self._make_instances(r, self._ids) for r in _REGISTRIES)
+        self.flies_in_c = not (self.estimators or self.avoiders)
         self._list_data_parts()
 
     def _make_instances(self, registry: Registry[Any], ids: list[int]) -> list[Guarded]:
@@ -162,10 +163,6 @@ class PluginSwarm(Swarm):
             return
         self.reason[:], self.score[:] = _PLUGIN_REASON, 0.0
         self.digest[:] = self.table_hash[: len(self.ids)]
-
-    def begin(self, slot: int) -> tuple[int, ...]:
-        self.decide(slot)
-        return self.emit(slot)
 
     def emit(self, slot: int) -> tuple[int, ...]:
         senders = super().emit(slot)
@@ -246,14 +243,6 @@ class PluginSwarm(Swarm):
         for index, avoider in enumerate(self.avoiders[: len(self.ids)]):
             if self.active[index] and self.present[index]:
                 self.command[:, index] = avoider.check_command(avoider.command(self.tables[index], slot, step), slot)
-
-    def fly(self, slot: int) -> None:
-        if not (self.estimators or self.avoiders):
-            super().fly(slot)
-            return
-        for step in range(self.config.steps):
-            self.steer(slot, step)
-            self.move(step)
 
     def with_own_tables(self, slot: int) -> Swarm:
         """Not supported: agents have tables of their own already."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import operator
+import traceback
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +57,7 @@ class Guarded:
         try:
             ids = list(answer)
         except Exception:
-            fault = f"gave {shown(answer)} in slot {slot}; allowed: a list of the ids that send"
-            raise PluginError(f"{self.name}, senders", fault) from None
+            self._fail("senders", f"gave {shown(answer)} in slot {slot}; allowed: a list of the ids that send")
         return [self._check_id(agent, "senders", slot, 1, agents, "1") for agent in ids]
 
     def _check_id(self, answer: object, method: str, slot: int, low: int, high: int, least: str) -> int:
@@ -66,15 +66,15 @@ class Guarded:
         except Exception:  # whatever its __index__ raises
             number, least = low - 1, f"an integer, {least}"
         if not low <= number <= high:
-            fault = f"chose agent {shown(answer)} in slot {slot}; allowed: {least} to {high}"
-            raise PluginError(f"{self.name}, {method}", fault)
+            self._fail(method, f"chose agent {shown(answer)} in slot {slot}; allowed: {least} to {high}")
         return number
 
     def check_own_data(self, answer: object, size: int) -> bytes:
         """Check the return value of ``own_data``: as many bytes as ``own_bytes`` declares."""
-        if not isinstance(answer, (bytes, bytearray)) or len(answer) != size:
-            size_text = f"{len(answer)} bytes" if isinstance(answer, (bytes, bytearray)) else shown(answer)
-            raise PluginError(f"{self.name}, own_data", f"gave {size_text}, declared {size}")
+        if not isinstance(answer, (bytes, bytearray)):
+            self._fail("own_data", f"gave {shown(answer)}, declared {size}")
+        if len(answer) != size:
+            self._fail("own_data", f"gave {len(answer)} bytes, declared {size}")
         return bytes(answer)
 
     def check_command(self, answer: Any, slot: int) -> tuple[float, ...]:
@@ -84,14 +84,16 @@ class Guarded:
         except Exception:
             velocity = ()
         if len(velocity) != 3 or not all(map(math.isfinite, velocity)):
-            fault = f"gave {shown(answer)} in slot {slot}; allowed: three finite numbers"
-            raise PluginError(f"{self.name}, command", fault)
+            self._fail("command", f"gave {shown(answer)} in slot {slot}; allowed: three finite numbers")
         return velocity
 
     def check_estimates(self, *arrays: NDArray[np.float64], slot: int) -> None:
         """Check that ``estimate`` has written finite numbers."""
         if not all(np.isfinite(array).all() for array in arrays):
-            raise PluginError(f"{self.name}, estimate", f"wrote a number that is not finite in slot {slot}")
+            self._fail("estimate", f"wrote a number that is not finite in slot {slot}")
+
+    def _fail(self, method: str, fault: str) -> NoReturn:
+        raise PluginError(f"{self.name}, {method}", fault) from None
 
 
 def _has(part: object, method: str) -> bool:
@@ -105,6 +107,8 @@ def _guarded(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         except DtsaError:
             raise
         except (Exception, SystemExit, GeneratorExit) as error:  # a plug-in does not end the program
-            raise PluginError.from_exception(part, error) from error
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{frame.filename}:{frame.lineno}"
+            raise PluginError(part, f"{type(error).__name__}: {error} ({place})") from error
 
     return call

@@ -44,11 +44,6 @@ def minus(a: Vector, b: Vector) -> Vector:
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
-def scaled(factor: float, a: Vector) -> Vector:
-    """``factor`` a."""
-    return (factor * a[0], factor * a[1], factor * a[2])
-
-
 def norm(a: Vector) -> float:
     """|a|."""
     return math.sqrt(dot(a, a))

@@ -37,15 +37,14 @@ def intent(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Ve
     age = age_s(row, rules, slot, step)
     ago = 0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.steps + step
     powers, ways = decay_table(rules.tau, rules.dt)
-    at = max(0, min(ago, DECAY_STEPS - 1))  # a frame of the next slot may be heard before this one is over
-    q, distance = powers[at], ways[at]
-    position, velocity = [], []
-    for axis in range(3):
-        c = row.intent[axis]
-        d = row.velocity[axis] - c
-        position.append(row.position[axis] + c * age + d * distance)
-        velocity.append(c + d * q)
-    return (position[0], position[1], position[2]), (velocity[0], velocity[1], velocity[2])
+    ago = max(0, min(ago, DECAY_STEPS - 1))  # a frame of the next slot may be heard before this one is over
+    q, distance = powers[ago], ways[ago]
+    moved = []
+    for p, v, c in zip(row.position, row.velocity, row.intent, strict=True):
+        d = v - c
+        moved.append((p + c * age + d * distance, c + d * q))
+    (x, vx), (y, vy), (z, vz) = moved
+    return (x, y, z), (vx, vy, vz)
 
 
 @lru_cache(maxsize=8)

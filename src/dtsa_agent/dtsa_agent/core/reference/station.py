@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -90,12 +90,9 @@ class Station:
     :param rounds: an agent that rests sends at least so often, in rounds.
     """
 
-    def __init__(
-        self, settings: Settings, rules: Rules, agent: Agent, now: Ns, rounds: int,
-        on_restart: Callable[[], None] = lambda: None,
-    ) -> None:  # fmt: skip
+    def __init__(self, settings: Settings, rules: Rules, agent: Agent, now: Ns, rounds: int) -> None:
         c, n, slot_ns = settings, rules.agents, settings.slot_ns
-        self.settings, self.rules, self.agent, self.on_restart = c, rules, agent, on_restart
+        self.settings, self.rules, self.agent = c, rules, agent
         anchors, mains = rules.anchor_every * n * slot_ns, rounds * n * slot_ns
         self.peers = [Peer() for _ in range(n)]
         self.cycle = rules.slot_cycle
@@ -111,7 +108,7 @@ class Station:
         self.earlier_since = 0
         self.earlier_ns: Ns | None = None
         self.flight_error_ns, self.name_turn = 0, 0
-        self.same_id_until: Ns | None = None
+        self.same_id_until = now  # another agent has sent with the own id
         self.refused_since: Ns | None = None
         self.slot, self.first, self.origin_ns = -1, -1, 0
         self.running = self.awaits = self.newcomer = self.has_sent = self.leaving = self.gone = False
@@ -303,7 +300,6 @@ class Station:
             p.offset_ns = p.report_ns = p.sum_ns = None
             p.hears_us = 0
         self.agent.restart()
-        self.on_restart()
 
     def _receive_frame(self, slot: int, frame: bytes) -> None:
         try:
@@ -317,17 +313,13 @@ class Station:
 
     def _find_hover_reason(self, slot: int, now: Ns) -> int:
         quorum = self._has_quorum(now)
-        if self._has_id_conflict(now):
+        if now < self.same_id_until:
             return HOVERS_SAME_ID
         if self.has_sent and slot >= self.first + self.rules.agents and not self.agent.memory.probation:
             self.newcomer = False
         if self.newcomer:
             return HOVERS_NEW
         return FLIES if quorum else HOVERS_QUORUM
-
-    def _has_id_conflict(self, now: Ns) -> bool:
-        """Whether another agent has sent with the own id lately."""
-        return self.same_id_until is not None and now < self.same_id_until
 
     def _withholds_frame(self, slot: int, now: Ns) -> bool:
         """Whether the agent does not send its frame.
@@ -337,7 +329,7 @@ class Station:
         begin at other times.
         """
         is_deaf = now - self.heard_ns > self.patience_ns and not self.settings.keeps_time
-        return (self.newcomer and self._has_id_conflict(now)) or (is_deaf and bool(self._draw(slot) & 1))
+        return (self.newcomer and now < self.same_id_until) or (is_deaf and bool(self._draw(slot) & 1))
 
     def _open_slot(self, slot: int, now: Ns) -> None:
         self._close_slot()
@@ -390,10 +382,9 @@ class Station:
 
     def _classify_own_id(self, data: bytes, arrival: Ns, apart: int) -> int:
         """Classify a datagram with the own id: echo or replay of an own one, or another agent with that id."""
-        half = self.settings.slot_ns // 2
         if data in self.sent_history:
             return REPEATED
-        if not -half < apart < half:
+        if abs(apart) >= self.settings.slot_ns // 2:
             return OTHER_TIME
         self.same_id_until = arrival + self.patience_ns
         return SAME_ID

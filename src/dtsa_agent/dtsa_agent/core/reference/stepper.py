@@ -41,7 +41,7 @@ def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
 class ReferenceSwarm(Swarm):
     """Some or all agents of one swarm, each with a table of its own; parameters are those of :class:`Swarm`."""
 
-    all_in_c = False
+    all_in_c = flies_in_c = False
     shares = False  # beside agents that share a table: those that are switched off hear, too
 
     def __init__(
@@ -75,15 +75,6 @@ class ReferenceSwarm(Swarm):
                 data = b""
             self.frame_length[place], self.frames[place, : len(data)] = len(data), np.frombuffer(data, np.uint8)
         return tuple(np.flatnonzero(self.frame_length).tolist())
-
-    def begin(self, slot: int) -> tuple[int, ...]:
-        self.decide(slot)
-        return self.emit(slot)
-
-    def fly(self, slot: int) -> None:
-        for step in range(self.config.steps):
-            self.steer(slot, step)
-            self.move(step)
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         for place in np.flatnonzero(self.active & (self.present > 0)) if estimate else ():

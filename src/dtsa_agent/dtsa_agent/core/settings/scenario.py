@@ -60,14 +60,13 @@ class Plan:
 
 
 class Course:
-    """How far some agents, (L,) indices ``local``, are with their plans.
+    """How far some agents, (L,) indices ``local``, are with their plans: the memory of ``swarm_advance``.
 
-    From the slot's number and an agent's own position alone: an agent runs this for itself, the simulator and the
-    metrics for all. The same numbers in, the same goals out.
+    From the slot's number and an agent's own position alone: an agent runs this for itself, the simulator for all.
     """
 
     def __init__(self, plan: Plan, local: NDArray[np.int32]) -> None:
-        self._start, self._moving, self._legs = plan.start[:, local], plan.moving[local], len(plan.goals)
+        self._start = plan.start[:, local]
         self.leg = np.full(len(local), -1, dtype=np.int64)  # index of the present goal, -1: waits for its first slot
         self._since = self.leg.copy()  # slot of arrival at the present goal, -1: under lengths
         self.changed = self.leg.copy()  # slot in which that became its goal
@@ -79,29 +78,13 @@ class Course:
             "leg": self.leg, "since": self._since, "changed": self.changed, "goal": self.goal,
         }  # fmt: skip
         self._borrowed = {name: memory(array) for name, array in arrays.items()}
-        sizes = {"n": plan.start.shape[1], "count": len(local), "goal_count": self._legs, "r_min": plan.r_min}
-        self.kernel = ffi.new("course *", {**sizes, **self._borrowed})
+        sizes = {"n": plan.start.shape[1], "count": len(local), "goal_count": len(plan.goals), "r_min": plan.r_min}
+        self.kernel = ffi.new("course *", {**sizes, **self._borrowed})  # for swarm_advance
 
     def reset(self) -> None:
         """Back to the start of the flight."""
         self.leg[:] = self._since[:] = self.changed[:] = -1
         self.goal[:] = self._start
-
-    @property
-    def active(self) -> NDArray[np.bool_]:
-        """The agents that fly now, (L,); the others hover."""
-        return np.asarray(self._moving & (self.leg >= 0))
-
-    @property
-    def final(self) -> NDArray[np.bool_]:
-        """The agents that have no further goal after the present one, (L,)."""
-        return np.asarray(~self._moving | (self.leg == self._legs - 1))
-
-    def advance(self, slot: int, position: Array) -> bool:
-        """Note where the agents are, (3, L) m, when a slot begins; returns whether any goal has changed."""
-        if position.shape != self.goal.shape:
-            raise ValueError(f"position: shape {position.shape}")
-        return bool(lib.course_advance(self.kernel, slot, memory(np.ascontiguousarray(position, dtype=np.float64))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +100,6 @@ class Scenario:
     moving: NDArray[np.bool_]
     plan: Plan | None = None
     goals_known: bool = True  # all know where everybody wants to be in each slot
-    policy_key: int | None = None  # by which policies draw lots; None: it is made when it is needed
 
     def course(self, local: NDArray[np.int32]) -> Course | None:
         """The state of a flight along the plan, of the agents with indices ``local``; None without a plan."""

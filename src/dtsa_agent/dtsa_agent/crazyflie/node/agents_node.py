@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,65 +51,38 @@ PUSH_M = 0.3  # farthest that an agent makes way at once
 FENCE_GAIN = 1.5  # 1/s: commands towards the fence shrink with the distance, for a vehicle outside ends the mission
 
 
-class ExternalVehicles:
-    """Vehicles that agents steer and another program flies.
+def steer(
+    swarm: Swarm, slot: int, fence: NDArray[np.float64] | None = None, way: NDArray[np.float64] | None = None
+) -> None:
+    """Decide the commands (`swarm.command`) of agents whose vehicles another program flies.
 
-    :param swarms: the agents, in one or several swarms; positions and velocities are written into them from outside.
-    :param every: slots between two commands.
-    :param send: takes the index of a swarm and its agents' commanded velocities, m/s, frame map.
-    :param fence: m, frame map, corners of the box that no command leads out of; None: there is none.
+    :param fence: m, (2, 3, 1), frame map, corners of the box that no command leads out of; None: there is none.
+    :param way: m, (3, L), from where they are to where they come to rest; None: they fly on to their goals.
     """
+    goal = swarm.goal.copy()  # the protocol still counts with it
+    if way is not None:
+        swarm.goal[:] = swarm.position + way
+    swarm.steer(slot, 0)
+    swarm.goal[:] = goal
+    still = swarm.active == 0
+    if still.any():
+        away = (swarm.scenario.start[:, swarm.local] - swarm.position)[:, still]
+        swarm.command[:, still] = np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
+    if fence is not None:
+        swarm.command[:] = np.clip(swarm.command, *(FENCE_GAIN * (fence - swarm.position)))
 
-    def __init__(
-        self, swarms: Sequence[Swarm], every: int, send: Callable[[int, NDArray[np.float64]], None],
-        fence: tuple[Vector, Vector] | None = None,
-    ) -> None:  # fmt: skip
-        self._swarms, self._every, self._send = swarms, every, send
-        self._fence = None if fence is None else np.array(fence)[:, :, None]
-        ends = np.cumsum([len(swarm.ids) for swarm in swarms]).tolist()
-        self._columns = [slice(end - len(swarm.ids), end) for swarm, end in zip(swarms, ends, strict=True)]
-        self._stopping = False
 
-    def set_positions(self, position: NDArray[np.float64]) -> None:
-        """Set where the vehicles are, (3, L) m, frame map."""
-        for swarm, columns in zip(self._swarms, self._columns, strict=True):
-            swarm.position[:] = swarm.track[:] = position[:, columns]
-
-    def stop_here(self) -> None:
-        """Have all agents come to rest, none above another one; they avoid each other as before."""
-        self._stopping = True
-
-    def send_commands(self, slot: int, index: int = 0) -> None:
-        """Send the commands of a slot to the vehicles of a swarm."""
-        if slot % self._every:
-            return
-        swarm = self._swarms[index]
-        goal = swarm.goal.copy()  # the protocol still counts with it
-        if self._stopping:
-            swarm.goal[:] = swarm.position + self._separation()[:, self._columns[index]]
-        swarm.steer(slot, 0)
-        swarm.goal[:] = goal
-        still = swarm.active == 0
-        if still.any():
-            away = (swarm.scenario.start[:, swarm.local] - swarm.position)[:, still]
-            swarm.command[:, still] = np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
-        if self._fence is not None:
-            low, high = FENCE_GAIN * (self._fence - swarm.position)
-            swarm.command[:] = np.clip(swarm.command, low, high)
-        self._send(index, swarm.command)
-
-    def _separation(self) -> NDArray[np.float64]:
-        """Return where each agent goes to get away from those that are near horizontally, (3, L) m."""
-        position = np.concatenate([swarm.position for swarm in self._swarms], axis=1)
-        apart = position[:2, :, None] - position[:2, None, :]
-        distance = np.linalg.norm(apart, axis=0)
-        index = np.arange(distance.shape[0])
-        above = (distance < SAME_PLACE_M) & (index[:, None] != index)  # one right above another: by their numbers
-        apart[0] += np.where(above, np.sign(index[:, None] - index) * SAME_PLACE_M, 0.0)
-        distance = np.maximum(np.linalg.norm(apart, axis=0), SAME_PLACE_M)
-        push = np.zeros_like(position)
-        push[:2] = (apart / distance * np.maximum(SPREAD_M - distance, 0.0)).sum(axis=2)
-        return push * np.minimum(1.0, PUSH_M / np.maximum(np.linalg.norm(push, axis=0), SAME_PLACE_M))
+def ways_apart(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the ways of all agents (m, (3, N)) to get away from those that are near horizontally."""
+    apart = position[:2, :, None] - position[:2, None, :]
+    distance = np.linalg.norm(apart, axis=0)
+    index = np.arange(distance.shape[0])
+    above = (distance < SAME_PLACE_M) & (index[:, None] != index)  # one right above another: by their numbers
+    apart[0] += np.where(above, np.sign(index[:, None] - index) * SAME_PLACE_M, 0.0)
+    distance = np.maximum(np.linalg.norm(apart, axis=0), SAME_PLACE_M)
+    push = np.zeros_like(position)
+    push[:2] = (apart / distance * np.maximum(SPREAD_M - distance, 0.0)).sum(axis=2)
+    return np.asarray(push * np.minimum(1.0, PUSH_M / np.maximum(np.linalg.norm(push, axis=0), SAME_PLACE_M)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,9 +107,9 @@ class CrazyflieAgents(RealtimeNode):
     ) -> None:  # fmt: skip
         # One station, one clock: no offsets, and nothing to align.
         super().__init__(node, config, ids, space, authenticator=authenticator(config), align=False)
-        every, swarms = max(1, round(1.0 / settings.command_hz / config.slot_s)), [a.swarm for a in self.agents]
-        fence = (settings.fence_min, settings.fence_max) if settings.fence else None
-        self._vehicles, count = ExternalVehicles(swarms, every, self._command, fence), len(swarms)
+        self._every, count = max(1, round(1.0 / settings.command_hz / config.slot_s)), len(self.agents)
+        self._fence = np.array([settings.fence_min, settings.fence_max])[:, :, None] if settings.fence else None
+        self._stopping = False
         self._names, self._origin = vehicles, np.array(settings.origin)
         self._odometry_time = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
@@ -148,8 +121,7 @@ class CrazyflieAgents(RealtimeNode):
         self._outputs = [node.create_publisher(VelocityWorld, f"/{name}/cmd_velocity_world", 1) for name in vehicles]
 
     def _sense(self) -> None:
-        if self._stop_here.take() is not None:
-            self._vehicles.stop_here()
+        self._stopping |= self._stop_here.take() is not None
         for index, feed in enumerate(self._inputs):
             message = feed.take()
             if message is not None:
@@ -158,7 +130,9 @@ class CrazyflieAgents(RealtimeNode):
         # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
         age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)
         velocity = np.concatenate([agent.swarm.velocity for agent in self.agents], axis=1)
-        self._vehicles.set_positions(self._measured + velocity * age)
+        position = self._measured + velocity * age
+        for index, agent in enumerate(self.agents):
+            agent.swarm.position[:] = agent.swarm.track[:] = position[:, index : index + 1]
 
     def _accept(self, index: int, message: Odometry, feed: Feed) -> None:
         """Check and store a vehicle's odometry. Without any for a while it gets no commands, and the bridge holds it.
@@ -177,13 +151,6 @@ class CrazyflieAgents(RealtimeNode):
         self.agents[index].swarm.velocity[:, 0] = rotate((q.x, q.y, q.z, q.w), (speed.x, speed.y, speed.z))
         self._odometry_time[index] = time.monotonic()
 
-    def _command(self, index: int, velocity: NDArray[np.float64]) -> None:
-        """Publish the command to a vehicle, (3, 1), m/s, frame map."""
-        if time.monotonic() - self._odometry_time[index] < STALE_S:
-            message = VelocityWorld()
-            message.vel.x, message.vel.y, message.vel.z = velocity[:, 0].tolist()
-            self._outputs[index].publish(message)
-
     def _prepare(self, message: Fields) -> bool:
         self._sense()
         if message.phase == Slot.PREPARE and np.isinf(self._odometry_time).any():
@@ -191,7 +158,15 @@ class CrazyflieAgents(RealtimeNode):
         return super()._prepare(message)
 
     def _fly(self, index: int) -> None:
-        self._vehicles.send_commands(self.agents[index].slot, index)
+        swarm, slot = self.agents[index].swarm, self.agents[index].slot
+        if slot % self._every:
+            return
+        ways = ways_apart(np.concatenate([a.swarm.position for a in self.agents], axis=1)) if self._stopping else None
+        steer(swarm, slot, self._fence, None if ways is None else ways[:, index : index + 1])
+        if time.monotonic() - self._odometry_time[index] < STALE_S:
+            message = VelocityWorld()
+            message.vel.x, message.vel.y, message.vel.z = swarm.command[:, 0].tolist()
+            self._outputs[index].publish(message)
 
 
 def _body(stop: Stop, supervised: bool) -> None:
@@ -216,7 +191,6 @@ def _body(stop: Stop, supervised: bool) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
     return run_node("crazyflie_agents", _body, args)
 
 

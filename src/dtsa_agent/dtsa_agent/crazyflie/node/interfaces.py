@@ -23,14 +23,10 @@ STOP_HERE = "/all/stop_here"  # of a mission's ground station: no agent flies on
 EVENTS = "/all/events"  # what the bridge does, and what it was ordered to do: its log
 EVENTS_QOS = QoSProfile(depth=500, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for subscribers that come late
 
-FullState: Any = msg.FullState
-Position: Any = msg.Position
-Status: Any = msg.Status
 VelocityWorld: Any = msg.VelocityWorld
 Arm: Any = srv.Arm
 GoTo: Any = srv.GoTo
 Land: Any = srv.Land
-NotifySetpointsStop: Any = srv.NotifySetpointsStop
 Takeoff: Any = srv.Takeoff
 # Its Python library waits for these, whether a program flies trajectories or not; they do nothing.
 TRAJECTORIES: list[tuple[Any, str]] = [

@@ -29,65 +29,54 @@ def why_refused(name: str, element: Any, value: object) -> str:
     return "" if math.isfinite(value) else f"{name}: {value!r} is not finite"  # type: ignore[arg-type]
 
 
-class FirmwareParameters:
-    """Parameters of the node that mirror the firmware's parameters of the connected Crazyflies.
+def declare_firmware(node: Node, bridge: Bridge, log: Callable[[str, str], None], masks: dict[str, int]) -> None:
+    """Declare address and initial position of each robot, and the parameters of each connected Crazyflie.
 
     :param log: called with a level and a line for each parameter that is set.
     :param masks: group mask of each robot, by its name; updated when the firmware's mask is set.
     """
+    vehicles = bridge.vehicles
+    elements: dict[str, dict[str, Any]] = {ALL: {}}  # entries of cflib's table, by target and `group.name`
 
-    def __init__(self, node: Node, bridge: Bridge, log: Callable[[str, str], None], masks: dict[str, int]) -> None:
-        self._node, self._vehicles, self._log, self._masks = node, bridge.vehicles, log, masks
-        self._elements: dict[str, dict[str, Any]] = {}  # entries of cflib's table, by robot and `group.name`
+    def declare(name: str, value: Any, *, read_only: bool) -> None:
+        if not node.has_parameter(name):
+            node.declare_parameter(name, value, ParameterDescriptor(read_only=read_only), ignore_override=True)
 
-    def declare(self) -> None:
-        """Declare address and initial position of each robot, and the parameters of each connected Crazyflie."""
-        common: dict[str, tuple[Any, float]] = {}
-        for robot, vehicle in self._vehicles.items():
-            self._declare(f"robots.{robot}.uri", vehicle.robot.uri, read_only=True)
-            self._declare(f"robots.{robot}.initial_position", list(vehicle.robot.initial_position), read_only=True)
-            found = vehicle.link.parameters()
-            self._elements[robot] = {name: element for name, (element, _) in found.items()}
-            self._declare_firmware(robot, found)
-            common = found | common
-        self._declare_firmware(ALL, common)
-        self._node.add_on_set_parameters_callback(self._check)
-        self._node.add_post_set_parameters_callback(self._apply)
-
-    def _declare_firmware(self, target: str, found: dict[str, tuple[Any, float]]) -> None:
-        for name, (element, value) in found.items():
-            self._declare(f"{target}{PARAMS}{name}", value, read_only=element.access == element.RO_ACCESS)
-
-    def _declare(self, name: str, value: Any, *, read_only: bool) -> None:
-        self._node.declare_parameter(name, value, ParameterDescriptor(read_only=read_only), ignore_override=True)
-
-    def _robots_with(self, target: str, name: str) -> list[str]:
-        """Return the robots of a target (a robot's name or `all`) that have a parameter."""
-        return [robot for robot, known in self._elements.items() if target in (ALL, robot) and name in known]
-
-    def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+    def check(parameters: Sequence[Parameter]) -> SetParametersResult:
         """Accept the request if every parameter can be set."""
         for parameter in parameters:
             target, _, name = parameter.name.partition(PARAMS)
-            for robot in self._robots_with(target, name):
-                problem = why_refused(name, self._elements[robot][name], parameter.value)
-                if target != ALL and not self._vehicles[robot].link.can_set:
-                    problem = f"{robot} is not connected, or its parameters are being read"
-                if problem:
-                    self._log("warn", f"parameter {parameter.name}: {problem}")
-                    return SetParametersResult(successful=False, reason=problem)
+            if (element := elements.get(target, {}).get(name)) is None:
+                continue
+            problem = why_refused(name, element, parameter.value)
+            if target != ALL and not vehicles[target].link.can_set:
+                problem = f"{target} is not connected, or its parameters are being read"
+            if problem:
+                log("warn", f"parameter {parameter.name}: {problem}")
+                return SetParametersResult(successful=False, reason=problem)
         return SetParametersResult(successful=True)
 
-    def _apply(self, parameters: Sequence[Parameter]) -> None:
-        """Send each new value to its Crazyflie; a parameter of `all` is set for each connected robot."""
+    def apply(parameters: Sequence[Parameter]) -> None:
+        """Send each new value to its Crazyflie; a parameter of `all` is set for each connected robot that has it."""
         for parameter in parameters:
             target, _, name = parameter.name.partition(PARAMS)
-            robots = self._robots_with(target, name)
             if target == ALL:
-                robots = [robot for robot in robots if self._vehicles[robot].link.can_set]
-                self._node.set_parameters([Parameter(f"{r}{PARAMS}{name}", value=parameter.value) for r in robots])
-            elif robots:
-                self._vehicles[target].link.set_parameter(name, parameter.value)
+                robots = [r for r, v in vehicles.items() if v.link.can_set and name in elements[r]]
+                node.set_parameters([Parameter(f"{r}{PARAMS}{name}", value=parameter.value) for r in robots])
+            elif name in elements.get(target, {}):
+                vehicles[target].link.set_parameter(name, parameter.value)
                 if name == GROUPS:
-                    self._masks[target] = int(parameter.value)
-                self._log("info", f"parameter {parameter.name} = {parameter.value:g}")
+                    masks[target] = int(parameter.value)
+                log("info", f"parameter {parameter.name} = {parameter.value:g}")
+
+    for robot, vehicle in vehicles.items():
+        declare(f"robots.{robot}.uri", vehicle.robot.uri, read_only=True)
+        declare(f"robots.{robot}.initial_position", list(vehicle.robot.initial_position), read_only=True)
+        found = vehicle.link.parameters()
+        elements[robot] = {name: element for name, (element, _) in found.items()}
+        elements[ALL] |= elements[robot]
+        for name, (element, value) in found.items():
+            for target in (robot, ALL):
+                declare(f"{target}{PARAMS}{name}", value, read_only=element.access == element.RO_ACCESS)
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(apply)

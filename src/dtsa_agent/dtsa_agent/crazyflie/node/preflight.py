@@ -67,20 +67,14 @@ def _links(vehicles: list[CrazyflieVehicle]) -> Lines:
 
 
 def _firmware(vehicles: list[CrazyflieVehicle]) -> Lines:
-    groups: dict[tuple[int, str], list[str]] = {}
-    for v in vehicles:
-        if v.link.firmware is not None:
-            groups.setdefault(v.link.firmware, []).append(v.name)
-    for (protocol, revision), names in groups.items():
-        text = f"protocol {protocol}, revision {revision}"
+    versions = {v.name: v.link.firmware for v in vehicles if v.link.firmware is not None}
+    texts = {name: f"protocol {protocol}, revision {revision}" for name, (protocol, revision) in versions.items()}
+    for name, (protocol, _) in versions.items():
         if protocol < MIN_PROTOCOL:
-            yield FAIL, f"{', '.join(names)}: {text}: update it (protocol {MIN_PROTOCOL} or later)"
-        elif len(groups) > 1:
-            yield WARN, f"{', '.join(names)}: {text}: not the same as the others'"
-        else:
-            yield OK, f"all {len(names)}: {text}"
-    if not groups:
-        yield NOBODY
+            yield FAIL, f"{name}: {texts[name]}: update it (protocol {MIN_PROTOCOL} or later)"
+        elif len(set(texts.values())) > 1:
+            yield WARN, f"{name}: {texts[name]}: not the same as the others'"
+    yield (OK, f"all {len(texts)}: {next(iter(texts.values()))}") if texts else NOBODY
 
 
 def _batteries(connected: Connected) -> Lines:
@@ -103,7 +97,7 @@ def _positions(connected: Connected) -> Lines:
             yield FAIL, f"{v.name}: not finite {where}"
         elif offsets[-1] > MAX_START_OFFSET_M:
             yield WARN, f"{v.name}: at {where} in the world, {offsets[-1]:.2f} m from its initial_position"
-        if v.tracker is not None:
+        if v.tracker.settings.enabled:
             rates.append(v.tracker.rate_hz(now))
             if rates[-1] == 0.0:
                 yield FAIL, f"{v.name}: not seen by motion capture {v.tracker.reason}".rstrip()
@@ -115,7 +109,7 @@ def _clocks(station: GroundStationSettings, connected: Connected) -> Lines:
     if not station.positions.enabled:
         yield OK, "one clock, the station's: there is no motion capture"
         return
-    trackers = {v.name: v.tracker for v, _ in connected if v.tracker is not None and v.tracker.latencies}
+    trackers = {v.name: v.tracker for v, _ in connected if v.tracker.latencies}
     ages = {name: quantile(tracker.latencies, 0.5) * 1000 for name, tracker in trackers.items()}
     for name, age in ages.items():
         if not MIN_POSE_AGE_MS <= age <= MAX_POSE_AGE_MS:
@@ -141,7 +135,8 @@ def _budget(bridge: Bridge) -> Lines:
     loads, overload_level = bridge.settings.loads, WARN if bridge.settings.station.force_budget else FAIL
     for load in loads:
         yield OK if load.fits else overload_level, str(load)
-    for name in bridge.radios.foreign:
-        yield WARN, f"radio {name}: packets are repeated: another transmitter uses its channel"
+    for name, dongle in sorted(bridge.radios.dongles.items()):
+        if dongle.foreign:
+            yield WARN, f"radio {name}: packets are repeated: another transmitter uses its channel"
     if not loads:
         yield OK, "no radios (udp, usb)"

@@ -12,11 +12,10 @@ from functools import partial
 from typing import Any
 
 from builtin_interfaces.msg import Duration as DurationMsg
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from dtsa_msgs.msg import Status as StateMessage
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import Log
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -26,22 +25,19 @@ from std_srvs.srv import Empty, SetBool, Trigger
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.commands import FULL_STATE, POSITION, VELOCITY_WORLD, TopicThread, check_setpoint, of_message
-from dtsa_agent.crazyflie.positions import NAMED_POSES, PoseTracker, PositionSettings, quantile
-from dtsa_agent.crazyflie.settings import SwarmSettings
+from dtsa_agent.crazyflie.commands import FULL_STATE, POSITION, VELOCITY_WORLD, TopicThread, of_message
+from dtsa_agent.crazyflie.positions import NAMED_POSES, PositionSettings, quantile
 from dtsa_agent.crazyflie.state import OFF, State, VehicleState, place_text, rotate_inverse
 from dtsa_agent.crazyflie.vehicle import CrazyflieVehicle
 from dtsa_agent.ros.common.cdr import UNKNOWN, diagonal
 
-from . import interfaces
-from .interfaces import EVENTS, EVENTS_QOS, STATE, TRAJECTORIES
-from .parameters import FirmwareParameters
+from .interfaces import STATE, TRAJECTORIES, msg, srv
+from .parameters import declare_firmware
 
 FRAME = "world"
-LATEST_ONLY, QUEUE = QoSProfile(depth=1), QoSProfile(depth=10)
+LATEST_ONLY = QoSProfile(depth=1)
 # Takes reliable publishers and others; a pose that is late is worth nothing.
 SENSOR = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-LEVELS = {"info": 20, "warn": 30, "error": 40}
 ARMED_S, ARMED_POLL_S = 3.0, 0.02  # longest wait for motors that are to run, or to be locked
 LOW_POWER = 3  # pm_state
 MAX_CLOCK_S = 0.1  # a sender's clock that is wrong makes a command at most so much older
@@ -58,7 +54,6 @@ def seconds(duration: DurationMsg) -> float:
 
 
 def _short(value: Any) -> str:
-    """A field of a request for people."""
     if isinstance(value, DurationMsg):
         return f"{seconds(value):g} s"
     if isinstance(value, Point):
@@ -66,13 +61,21 @@ def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _go_to(vehicle: CrazyflieVehicle, request: Any) -> str:
-    goal = request.goal.x, request.goal.y, request.goal.z
-    return vehicle.go_to(goal, request.yaw, seconds(request.duration), request.relative)
-
-
-def _notify(vehicle: CrazyflieVehicle, request: Any) -> str:
-    return vehicle.notify_setpoints_stop(request.remain_valid_millisecs)
+# Services that take an order to one or all; the last one tells programs that all are there.
+ORDERS: list[tuple[Any, str, Order | None]] = [
+    *((kind, name, None) for kind, name in TRAJECTORIES),
+    (srv.Takeoff, "takeoff", lambda v, r: v.takeoff(r.height, seconds(r.duration))),
+    (srv.Land, "land", lambda v, r: v.land("service", r.height, seconds(r.duration))),
+    (srv.GoTo, "go_to", lambda v, r: v.go_to((r.goal.x, r.goal.y, r.goal.z), r.yaw, seconds(r.duration), r.relative)),
+    (srv.Arm, "arm", lambda v, r: v.arm(r.arm)),
+    (srv.NotifySetpointsStop, "notify_setpoints_stop", lambda v, r: v.notify_setpoints_stop(r.remain_valid_millisecs)),
+    (Empty, "emergency", lambda v, r: v.stop("service emergency")),
+]
+STREAMS = (
+    (msg.FullState, "cmd_full_state", FULL_STATE),
+    (msg.Position, "cmd_position", POSITION),
+    (msg.VelocityWorld, "cmd_velocity_world", VELOCITY_WORLD),
+)
 
 
 # -- what comes in ----------------------------------------------------------------------------------------------------
@@ -90,14 +93,9 @@ class BridgeInputs:
 
     def offer(self) -> None:
         """Create everything; `/all/emergency` is last: a program that waits for it knows that all else is there."""
-        streams = (
-            (interfaces.FullState, "cmd_full_state", FULL_STATE),
-            (interfaces.Position, "cmd_position", POSITION),
-            (interfaces.VelocityWorld, "cmd_velocity_world", VELOCITY_WORLD),
-        )
-        FirmwareParameters(self._node, self._bridge, self._log, self._masks).declare()
+        declare_firmware(self._node, self._bridge, self._log, self._masks)
         for name, vehicle in self._bridge.vehicles.items():
-            for message, topic, kind in () if self._on_board else streams:  # agents on board steer themselves
+            for message, topic, kind in () if self._on_board else STREAMS:  # agents on board steer themselves
                 self._commands.subscribe(message, f"{name}/{topic}", partial(self._stream, kind, vehicle), LATEST_ONLY)
             self._create_services(name, [name])
             self._node.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
@@ -107,19 +105,8 @@ class BridgeInputs:
         self._create_services("all", list(self._bridge.vehicles))
 
     def _create_services(self, prefix: str, names: list[str]) -> None:
-        """Create the services that take an order to one or all; `emergency` is the last."""
-        enable = [(SetBool, "enable", lambda v, r: v.enable(r.data))] if self._on_board else []
-        services: list[tuple[Any, str, Order | None]] = [
-            *enable,
-            *((kind, name, None) for kind, name in TRAJECTORIES),
-            (interfaces.Takeoff, "takeoff", lambda v, r: v.takeoff(r.height, seconds(r.duration))),
-            (interfaces.Land, "land", lambda v, r: v.land("service", r.height, seconds(r.duration))),
-            (interfaces.GoTo, "go_to", _go_to),
-            (interfaces.Arm, "arm", lambda v, r: v.arm(r.arm)),
-            (interfaces.NotifySetpointsStop, "notify_setpoints_stop", _notify),
-            (Empty, "emergency", lambda v, r: v.stop("service emergency")),
-        ]
-        for kind, service, order in services:
+        enable: list[tuple[Any, str, Order]] = [(SetBool, "enable", lambda v, r: v.enable(r.data))]
+        for kind, service, order in [*(enable if self._on_board else []), *ORDERS]:
             group = self._waiting if service == "arm" else None
             callback = partial(self._serve, prefix, names, service, order)
             self._node.create_service(kind, f"{prefix}/{service}", callback, callback_group=group)
@@ -157,7 +144,9 @@ class BridgeInputs:
             return False, problem
         if service == "go_to" and len(members) > 1 and not request.relative:
             return False, "a go_to of all must be relative: they would meet in one place"
-        return self._bridge.order_each(members, lambda vehicle: order(vehicle, request))
+        done, text = self._bridge.order_each(members, lambda vehicle: order(vehicle, request))
+        notes = [self._bridge.vehicles[name].longer for name in members] if service == "land" else []
+        return done, "; ".join(filter(None, (text, *notes)))
 
     async def _wait_armed(self, names: list[str], arm: bool, done: bool, text: str) -> tuple[bool, str]:
         """Wait until motors may run, or are locked; the executor serves others meanwhile."""
@@ -182,17 +171,11 @@ class BridgeInputs:
 
     def _stream(self, kind: str, vehicle: CrazyflieVehicle, message: Any, published: float) -> None:
         """Give a message, published at a Unix time (s), to its vehicle, and say why it does not count."""
-        station = vehicle.station
-        origin = station.room_origin_in_world
         stamp = time.monotonic() - min(max(time.time() - published, 0.0), MAX_CLOCK_S)  # as old as its publication
         try:
-            setpoint = of_message(kind, message, origin, stamp)
-            check_setpoint(setpoint, station.safety, origin, station.max_stream_mps)
+            problem = vehicle.command(of_message(kind, message, vehicle.station.room_origin_in_world, stamp))
         except ValueError as error:
             vehicle.refused, problem = vehicle.refused + 1, str(error)
-        else:
-            reason = f"{vehicle.state.name.lower()}: {vehicle.machine.reason}"
-            problem = "" if vehicle.command(setpoint) else f"commands are not accepted now ({reason})"
         if problem:
             self._node.get_logger().warning(f"{vehicle.name}: {problem}", throttle_duration_sec=1.0)
 
@@ -210,34 +193,29 @@ class BridgeInputs:
 
 
 # -- motion capture ---------------------------------------------------------------------------------------------------
-def named_pose_array() -> Any:
-    """Return the type of the named poses; ConfigError: its package is not in the workspace."""
-    try:
-        from motion_capture_tracking_interfaces.msg import NamedPoseArray
-    except ImportError:
-        allowed = "pose, or named_poses with motion_capture_tracking_interfaces in the workspace (it is not there)"
-        raise ConfigError("station.positions.source", NAMED_POSES, allowed) from None
-    return NamedPoseArray
-
-
 def subscribe_positions(poses: TopicThread, settings: PositionSettings, vehicles: dict[str, CrazyflieVehicle]) -> None:
     """Listen to motion capture, if there is one, in a thread that is not started yet.
 
-    :raises ConfigError: the type of the named poses is not there.
+    :raises ConfigError: the package of the named poses is not in the workspace.
     """
+
+    def receive_named(message: Any, _: float) -> None:
+        for named in message.poses:
+            if named.name in vehicles:
+                _receive(vehicles[named.name], message.header, named.pose)
+
     if settings.source == NAMED_POSES:
+        try:
+            from motion_capture_tracking_interfaces.msg import NamedPoseArray
+        except ImportError:
+            allowed = "pose, or named_poses with motion_capture_tracking_interfaces in the workspace (it is not there)"
+            raise ConfigError("station.positions.source", NAMED_POSES, allowed) from None
         for topic in sorted({settings.topic_of(name) for name in vehicles}):
-            poses.subscribe(named_pose_array(), topic, partial(_receive_named, vehicles), SENSOR)
+            poses.subscribe(NamedPoseArray, topic, receive_named, SENSOR)
     elif settings.enabled:
         for name, vehicle in vehicles.items():
             receive = lambda message, _, vehicle=vehicle: _receive(vehicle, message.header, message.pose)  # noqa: E731
             poses.subscribe(PoseStamped, settings.topic_of(name), receive, SENSOR)
-
-
-def _receive_named(vehicles: dict[str, CrazyflieVehicle], message: Any, _: float) -> None:
-    for named in message.poses:
-        if (vehicle := vehicles.get(named.name)) is not None:
-            _receive(vehicle, message.header, named.pose)
 
 
 def _receive(vehicle: CrazyflieVehicle, header: Any, pose: Any) -> None:
@@ -248,18 +226,16 @@ def _receive(vehicle: CrazyflieVehicle, header: Any, pose: Any) -> None:
 
 # -- what goes out ----------------------------------------------------------------------------------------------------
 class VehicleOutputs:
-    """Odometry, pose and status of one vehicle.
+    """Odometry, pose and status of one vehicle. There is no topic of poses where motion capture's has its name."""
 
-    :param pose: whether it has a topic of poses; motion capture's own may have its name.
-    """
-
-    def __init__(self, node: Node, name: str, pose: bool) -> None:
+    def __init__(self, node: Node, name: str, positions: PositionSettings) -> None:
         self._clock = node.get_clock()
         self._odom = node.create_publisher(Odometry, f"{name}/odom", LATEST_ONLY)
-        self._pose = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY) if pose else None
-        self._state = node.create_publisher(StateMessage, f"{name}/{STATE}", QUEUE)
+        captured = positions.enabled and positions.topic_of(name).lstrip("/") == f"{name}/pose"
+        self._pose = None if captured else node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
+        self._state = node.create_publisher(StateMessage, f"{name}/{STATE}", 10)
         ours = STATE == "status"  # Crazyswarm2's status is published beside ours
-        self._status = None if ours else node.create_publisher(interfaces.Status, f"{name}/status", QUEUE)
+        self._status = None if ours else node.create_publisher(msg.Status, f"{name}/status", 10)
         self._reported: State | None = None  # the last state that was not left to the regular status
         self._odom_wanted = self._pose_wanted = False  # is there a subscriber?
         self._counted = 0, 0  # packets sent and received up to the last status
@@ -290,55 +266,21 @@ class VehicleOutputs:
             self._pose.publish(PoseStamped(header=message.header, pose=message.pose.pose))
 
     def publish_status(self, vehicle: CrazyflieVehicle) -> None:
-        """Publish the status; also count the subscribers of odometry and pose."""
+        """Publish the status, ours and Crazyswarm2's; also count the subscribers of odometry and pose."""
         self._odom_wanted = self._odom.get_subscription_count() > 0
         self._pose_wanted = self._pose is not None and self._pose.get_subscription_count() > 0
-        message = state_message(vehicle, self._clock.now().to_msg())
-        self._state.publish(message)
-        if self._status is not None:
-            self._status.publish(self._status_message(vehicle, message))
-
-    def _status_message(self, vehicle: CrazyflieVehicle, ours: StateMessage) -> Any:
-        """Crazyswarm2's status; the packets are those since the one before."""
-        (sent, received), critical = self._counted, vehicle.robot.battery.voltage_critical
-        self._counted = ours.num_tx_unicast, ours.num_rx_unicast
-        return interfaces.Status(
-            header=ours.header, supervisor_info=ours.supervisor_info, battery_voltage=ours.battery_voltage,
-            rssi=ours.rssi, pm_state=LOW_POWER if 0.0 < ours.battery_voltage < critical else 0,
-            num_tx_unicast=ours.num_tx_unicast - sent, num_rx_unicast=ours.num_rx_unicast - received,
-            latency_unicast=min(round(ours.latency_ms), 0xFFFF),
-        )  # fmt: skip
-
-
-class BridgeOutputs:
-    """Odometry, pose and status of all, diagnostics and events."""
-
-    def __init__(self, node: Node, settings: SwarmSettings) -> None:
-        self._clock, self._name, positions = node.get_clock(), node.get_name(), settings.station.positions
-        names = [robot.name for robot in settings.robots]
-        captured = {positions.topic_of(name).lstrip("/") for name in names} if positions.enabled else set()
-        self._vehicles = {name: VehicleOutputs(node, name, f"{name}/pose" not in captured) for name in names}
-        self._events = node.create_publisher(Log, EVENTS.lstrip("/"), EVENTS_QOS)
-        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QUEUE)
-
-    def publish_report(self, vehicle: CrazyflieVehicle, report: VehicleState) -> None:
-        """Publish what a log packet says."""
-        self._vehicles[vehicle.name].publish_report(vehicle, report)
-
-    def publish_event(self, level: str, line: str) -> None:
-        """Publish one line of the log, for a mission's record."""
-        self._events.publish(Log(stamp=self._clock.now().to_msg(), level=LEVELS[level], name=self._name, msg=line))
-
-    def publish_status(self, vehicles: dict[str, CrazyflieVehicle]) -> None:
-        """Publish the status of all."""
-        for name, vehicle in vehicles.items():
-            self._vehicles[name].publish_status(vehicle)
-
-    def publish_diagnostics(self, vehicles: dict[str, CrazyflieVehicle]) -> None:
-        """Publish diagnostics of all."""
-        message = DiagnosticArray(status=[diagnostic(vehicle, time.monotonic()) for vehicle in vehicles.values()])
-        message.header.stamp = self._clock.now().to_msg()
-        self._diagnostics.publish(message)
+        ours = state_message(vehicle, self._clock.now().to_msg())
+        self._state.publish(ours)
+        if self._status is not None:  # its packets are those since the one before
+            (sent, received), critical = self._counted, vehicle.robot.battery.voltage_critical
+            self._counted = ours.num_tx_unicast, ours.num_rx_unicast
+            message = msg.Status(
+                header=ours.header, supervisor_info=ours.supervisor_info, battery_voltage=ours.battery_voltage,
+                rssi=ours.rssi, pm_state=LOW_POWER if 0.0 < ours.battery_voltage < critical else 0,
+                num_tx_unicast=ours.num_tx_unicast - sent, num_rx_unicast=ours.num_rx_unicast - received,
+                latency_unicast=min(round(ours.latency_ms), 0xFFFF),
+            )  # fmt: skip
+            self._status.publish(message)
 
 
 def state_message(vehicle: CrazyflieVehicle, stamp: Any) -> StateMessage:
@@ -356,9 +298,9 @@ def state_message(vehicle: CrazyflieVehicle, stamp: Any) -> StateMessage:
 
 
 def diagnostic(vehicle: CrazyflieVehicle, now: float) -> DiagnosticStatus:
-    """Return a vehicle's line in /diagnostics."""
-    level, state, reason = DiagnosticStatus.OK, vehicle.state, vehicle.action
-    silent = vehicle.tracker is not None and vehicle.tracker.rate_hz(now) == 0.0
+    """Return what /diagnostics says about a vehicle, and about motion capture, if there is any."""
+    level, state, reason, tracker = DiagnosticStatus.OK, vehicle.state, vehicle.action, vehicle.tracker
+    silent = tracker.settings.enabled and tracker.rate_hz(now) == 0.0
     if state in (State.EMERGENCY, State.LOST):
         level = DiagnosticStatus.ERROR
     elif state in OFF or reason.startswith(("battery", "hold", "land:")) or silent:
@@ -373,22 +315,19 @@ def diagnostic(vehicle: CrazyflieVehicle, now: float) -> DiagnosticStatus:
         "command latency, 99th percentile [ms]": f"{latency * 1000:.1f}",
         "commands refused": str(vehicle.refused),
         "reason": reason,
-    } | (position_values(vehicle.tracker, now) if vehicle.tracker is not None else {})  # fmt: skip
+    }
+    if tracker.settings.enabled:
+        refused = ", ".join(f"{kind} {number}" for kind, number in sorted(tracker.refused.items()))
+        values |= {
+            "positions [Hz]": f"{tracker.rate_hz(now):.0f}",
+            "positions sent": str(tracker.sent),
+            "position age [s]": f"{tracker.age(now):.2f}",
+            "position latency, median [ms]": f"{quantile(tracker.latencies, 0.5) * 1000:.1f}",
+            "position latency, 99th percentile [ms]": f"{quantile(tracker.latencies, 0.99) * 1000:.1f}",
+            "positions refused": refused or "0",
+            "last refusal": tracker.reason,
+        }
     return DiagnosticStatus(
         level=level, name=f"crazyflie_bridge: {vehicle.name}", message=state.name.lower(), hardware_id=vehicle.name,
         values=[KeyValue(key=key, value=value) for key, value in values.items()],
     )  # fmt: skip
-
-
-def position_values(tracker: PoseTracker, now: float) -> dict[str, str]:
-    """Return what /diagnostics says about motion capture and one vehicle."""
-    refused = ", ".join(f"{kind} {number}" for kind, number in sorted(tracker.refused.items()))
-    return {
-        "positions [Hz]": f"{tracker.rate_hz(now):.0f}",
-        "positions sent": str(tracker.sent),
-        "position age [s]": f"{tracker.age(now):.2f}",
-        "position latency, median [ms]": f"{quantile(tracker.latencies, 0.5) * 1000:.1f}",
-        "position latency, 99th percentile [ms]": f"{quantile(tracker.latencies, 0.99) * 1000:.1f}",
-        "positions refused": refused or "0",
-        "last refusal": tracker.reason,
-    }

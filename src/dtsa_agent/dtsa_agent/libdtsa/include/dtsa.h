@@ -61,7 +61,7 @@ enum {
     DTSA_POLICY_ALOHA,
     DTSA_POLICY_LEASE,
     DTSA_POLICY_INNOVATION,
-    DTSA_POLICY_EXTERNAL /* somebody else decides */
+    DTSA_POLICY_EXTERNAL /* the caller decides */
 };
 enum {
     DTSA_ESTIMATE_HOLD,
@@ -76,11 +76,11 @@ enum { DTSA_AVOID_ORCA, DTSA_AVOID_POTENTIAL, DTSA_AVOID_BVC, DTSA_AVOID_NONE, D
 
 /* Why a sender was expected. */
 enum {
-    DTSA_REASON_NOBODY,   /* A_p is empty and nobody else has a claim */
+    DTSA_REASON_NOBODY,   /* A_p is empty and no other agent has a claim */
     DTSA_REASON_TDMA,     /* slot modulo N */
     DTSA_REASON_BOOT,     /* boot round: everyone once, in id order */
     DTSA_REASON_AGE_CAP,  /* silent for longer than the age cap allows */
-    DTSA_REASON_PRIORITY, /* largest g, nobody within epsilon (eq:pfs) */
+    DTSA_REASON_PRIORITY, /* largest g, no other within epsilon (eq:pfs) */
     DTSA_REASON_TIE,      /* several within epsilon: largest counter h (eq:secondary) */
     DTSA_REASON_OLDEST,   /* all g are zero, or policy age: largest counter h */
     DTSA_REASON_RETURN,   /* slot reserved for the agents outside A_p */
@@ -91,7 +91,7 @@ enum {
     DTSA_REASON_LEASE_ANCHOR,    /* the owner's turn that is never given away */
     DTSA_REASON_LEASE_LEASED,    /* given away by its owner */
     DTSA_REASON_LEASE_ADOPTED,   /* given away by the next one alive: its owner is thought dead */
-    DTSA_REASON_LEASE_OPEN,      /* given to whoever has just woken or joined */
+    DTSA_REASON_LEASE_OPEN,      /* given to agents that have just woken or joined */
     DTSA_REASON_LEASE_ABSENT,    /* its owner is thought dead */
     DTSA_REASON_LEASE_PROBATION, /* its owner may not use it yet */
     DTSA_REASON_INNOVATION, /* policy innovation: largest counter h, weighed by the change of velocity */
@@ -123,10 +123,10 @@ typedef struct dtsa_avoid_params {
 /* Settings of policy lease. */
 typedef struct dtsa_lease_config {
     int anchor_every; /* M: every so many rounds an agent's turn is an anchor, 1..15 */
-    int open_every; /* S: of the turns given away every so many are open to all who wake; 0: none */
-    int adoption;   /* the turns of the dead are given away by the next one alive */
+    int open_every; /* S: of the turns given away every so many are open to agents that wake; 0: none */
+    int adoption;      /* the turns of absent agents are given away by the next agent alive */
     double depth_rate; /* c: turns given away per round of idleness */
-    double share;      /* no leases when more than this share of those alive has something to say */
+    double share;      /* no leases when more than this share of the agents alive is in A_p */
     int64_t patience;  /* slots of silence after which an agent is thought absent; 0: max(1000, 6 M
                           N), 6 K M N if it rests */
     int main_every;    /* K M: every so many rounds an anchor is a main one, a multiple of M, 15 at
@@ -142,7 +142,7 @@ typedef struct dtsa_config {
     int boot_round, return_every;
     double r_min;         /* m, at its goal (eq:remaining_t_slots) */
     int c_r;              /* the constant C of eq:remaining_t_slots, 1..255 */
-    int targets_known;    /* all know where all want to go */
+    int targets_known;    /* all agents know the targets of all */
     int gossip;           /* extended frames carry what was heard of others */
     double position_step; /* m, of positions in frames */
     uint64_t key;         /* of all draws */
@@ -154,7 +154,7 @@ typedef struct dtsa_config {
 } dtsa_config;
 
 /* Slot numbers on the air count modulo this: the largest multiple, up to 2^32, of all that policies
- * which agents can join count in slots. Who joins then takes the same turns as who has counted on. */
+ * which agents can join count in slots. An agent that joins then takes the same turns as the others. */
 DTSA_API uint64_t dtsa_slot_cycle(const dtsa_config *config);
 
 /* The name of a field that is out of range; NULL: all are fine. */
@@ -179,7 +179,7 @@ DTSA_API void dtsa_decay(double tau, double dt, int length, double *table);
 typedef struct dtsa_agent dtsa_agent;
 
 typedef struct dtsa_decision {
-    int chosen;      /* id that it takes for the slot's sender, 0: nobody */
+    int chosen;      /* id that it takes for the slot's sender, 0: no agent */
     int reason;      /* DTSA_REASON_ */
     int sends;       /* it is itself */
     double score;    /* g of the chosen, where the policy computed it */
@@ -219,42 +219,43 @@ DTSA_API int dtsa_agent_is_on(const dtsa_agent *agent);
 /* It hovers: what it commands is zero, and so is the command in its frames. */
 DTSA_API void dtsa_agent_hover(dtsa_agent *agent, int hovers);
 
-/* Own true state. Within r_min of its goal it is idle; farther away it wakes. */
+/* Own true state at the start of the slot, m and m/s, frame map; finite. Within r_min of its goal it
+ * is idle; farther away it wakes. */
 DTSA_API void dtsa_agent_set_state(dtsa_agent *agent, const double position[3],
                                    const double velocity[3]);
 
-/* final: no further goal is scheduled. */
+/* Where it flies to, m, frame map; final: no further goal is scheduled. */
 DTSA_API void dtsa_agent_set_goal(dtsa_agent *agent, const double goal[3], int final);
 
-/* A slot opens. Returns the length of the frame to send in it, 0: it is silent. Slots ascend; none
- * has to be missed, but they may be. */
+/* A slot opens. Returns the length of the frame to send in it, bytes; 0: it is silent. Slots ascend
+ * from 0; some may be left out. */
 DTSA_API int dtsa_agent_slot(dtsa_agent *agent, int64_t slot, uint8_t frame[DTSA_FRAME_MAX]);
 /* The frame of this slot has not been sent: the agent has been silent. */
 DTSA_API void dtsa_agent_unsent(dtsa_agent *agent);
 DTSA_API dtsa_decision dtsa_agent_decision(const dtsa_agent *agent);
 
-/* A frame was heard in a slot, before the slot's end; also the own one may be handed in. Returns
- * whether it was one of this swarm and time. Anything may be handed in: what is no frame is
- * counted. */
+/* A frame was heard in a slot, before the slot's end; also the own one may be handed in. Any bytes
+ * are allowed: what is no frame is counted (dtsa_status). Returns 1 if it was a frame of this swarm
+ * and time, else 0. */
 DTSA_API int dtsa_agent_hear(dtsa_agent *agent, int64_t slot, const uint8_t *data, long length);
 
 /* A slot is over: all that was heard in it has been handed in. */
 DTSA_API void dtsa_agent_end(dtsa_agent *agent, int64_t slot);
 
-/* Commanded velocity at control instant `step` of a slot; frames carry the last one where the
- * profile says so. */
+/* Commanded velocity, m/s, frame map, at control instant `step` of a slot, 0 to steps - 1; frames
+ * carry the last one where the profile says so. */
 DTSA_API void dtsa_agent_command(dtsa_agent *agent, int64_t slot, int step, double command[3]);
 
 DTSA_API dtsa_status dtsa_agent_status(const dtsa_agent *agent);
 
 /* ---- authentication: a frame is followed by 4 bytes that only holders of the key can make ---- */
 
-/* BLAKE2s, keyed, person "dtsa v1", over session (8 bytes), slot (8 bytes) and data. key_length: 16
- * .. 32. */
+/* BLAKE2s, keyed, person "dtsa v1", over session (8 bytes), slot (8 bytes) and data of `length`
+ * bytes. key_length: 16 to 32 bytes. */
 DTSA_API void dtsa_tag(const uint8_t *key, int key_length, uint64_t session, uint64_t slot,
                        const uint8_t *data, long length, uint8_t tag[DTSA_TAG_BYTES]);
-/* Length of the frame without its tag, 0: it is not authentic. It may come `late` slots after its
- * own. */
+/* Length of the frame without its tag, bytes; 0: it is not authentic. It may come up to `late` slots
+ * after its own. Any bytes are allowed. */
 DTSA_API long dtsa_open(const uint8_t *key, int key_length, uint64_t session, int64_t slot,
                         int late, const uint8_t *data, long length);
 

@@ -77,100 +77,129 @@ class MissionWatch(ChannelObserver):
         return bool(gaps.min() >= APART_M)
 
 
-class _MissionProcesses:
-    """The processes of a mission, and the one order in which they end; `attach`: a bridge runs already, and goes on."""
+class _Mission:
+    """One mission: its processes, and the one order in which they end; `attach`: a bridge runs already, and goes on."""
 
-    def __init__(self, settings: SwarmSettings, directory: Path, environment: dict[str, str], attach: bool) -> None:
-        self.settings, self._directory, self._attach = settings, directory, attach
-        self.context, self.progress = Context(), ProgressLine("fly")
-        self.bridge, self.agents, self._recorder = (Children(directory / "log", environment) for _ in range(3))
-        self._mission: GroundStation | None = None
+    def __init__(
+        self, run: RunConfig, settings: SwarmSettings, directory: Path, environment: dict[str, str], stop: Stop,
+        attach: bool,
+    ) -> None:  # fmt: skip
+        self.run, self.settings, self.directory, self.attach = run, settings, directory, attach
+        self.ended, self.context, self.progress = StopToken(stop), Context(), ProgressLine("fly")
+        self.bridge, self.agents, self.recorder = (Children(directory / "log", environment) for _ in range(3))
+        self.ground: GroundStation | None = None
 
     def start(self, swarm_yaml: Path) -> None:
         """Start the recorder, and the bridge unless there is one."""
         robots = [robot.name for robot in self.settings.robots]
-        arguments = ["--bag", str(self._directory / MISSION_BAG), "--names", *robots]
-        self._recorder.start("recorder", [], "dtsa_bench.crazyflies.missions.mission_record", arguments)
-        if not self._attach:
-            self.bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node",
-                              ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
+        arguments = ["--bag", str(self.directory / MISSION_BAG), "--names", *robots]
+        self.recorder.start("recorder", [], "dtsa_bench.crazyflies.missions.mission_record", arguments)
+        if not self.attach:
+            arguments = ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"]
+            self.bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node", arguments)
 
-    def take_off(
-        self, run: RunConfig, scenario: Scenario, domain: int, ended: StopToken
-    ) -> tuple[RunConfig, GroundStation]:
+    def take_off(self, scenario: Scenario, domain: int) -> GroundStation:
         """Connect all vehicles, start the agents, and bring the vehicles into the air, at their places.
 
         Nothing of ours keeps the bridge waiting: it runs before all others, on a processor of its own, and what takes
         a processor for seconds, as the start of the agents' process does, is over before a motor turns.
-
-        :returns: the run with these places, the mission.
         """
         avoid_last_processor()
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
-        check = None if self._attach else self.bridge.check
-        mission = self._mission = GroundStation(node, self.settings, scenario, ended, self.progress.show, check)
-        set_realtime(below(self.settings.station.priority, 1))
-        swarm = mission.connect(run.swarm)
-        if swarm != run.swarm:
+        check, priority = None if self.attach else self.bridge.check, self.settings.station.priority
+        ground = GroundStation(node, self.settings, scenario, self.ended, self.progress.show, check)
+        self.ground = ground
+        set_realtime(below(priority, 1))
+        swarm = ground.connect(self.run.swarm)
+        if swarm != self.run.swarm:
             self.progress.print_line(f"not where they would begin: exchange of roles, places {swarm.places}")
-            run = dataclasses.replace(run, swarm=swarm)
+            self.run = dataclasses.replace(self.run, swarm=swarm)
         self.progress.show("agents")
-        self._start_agents(run)
-        mission.wait_for_agents(self.agents.check)
-        mission.take_off()
-        return run, mission
-
-    def _start_agents(self, run: RunConfig) -> None:
-        settings, safety = self.settings, self.settings.station.safety
+        safety = self.settings.station.safety
         own = {
-            "command_hz": float(max(robot.command_rate_hz for robot in settings.robots)),
-            "priority": below(settings.station.priority, 2),
-            "vehicles": " ".join(robot.name for robot in settings.robots),
-            "origin": list(settings.station.room_origin_in_world),
+            "command_hz": float(max(robot.command_rate_hz for robot in self.settings.robots)),
+            "priority": below(priority, 2),
+            "vehicles": " ".join(robot.name for robot in self.settings.robots),
+            "origin": list(self.settings.station.room_origin_in_world),
             "fence": safety.geofence, "fence_min": list(safety.geofence_min), "fence_max": list(safety.geofence_max),
         }  # fmt: skip
-        arguments = parameter_arguments(self._directory, to_parameters(run.swarm.to_dict(), SwarmConfig) | own)
-        ids = list(range(1, run.swarm.agents + 1))
+        arguments = parameter_arguments(self.directory, to_parameters(swarm.to_dict(), SwarmConfig) | own)
+        ids = list(range(1, swarm.agents + 1))
         self.agents.start("agents", ids, "dtsa_agent.crazyflie.node.agents_node", arguments)
+        ground.wait_for_agents(self.agents.check)
+        ground.take_off()
+        return ground
 
-    def end(self, ended: StopToken) -> None:
+    def exchange(self, ground: GroundStation, options: FlightOptions) -> Flight:
+        """The exchange of places, and the landing; its results."""
+        ended, limits = self.ended, self.run.limits
+        run = dataclasses.replace(self.run, limits=dataclasses.replace(limits, stop_on_crash=False))
+        node = Node("channel", namespace=names.SWARM, context=self.context)
+        try:
+            declare_channel(node, run.air)
+            flight = RecordedFlight(node, run, self.directory, options.startup_s, answer_s=2.0, end_s=END_S)
+            channel, measurement = flight.channel, flight.measurement
+            assert isinstance(channel, RealtimeChannel)
+            shown = FlightProgress(self.progress, measurement, channel)
+            watch = MissionWatch(ground, channel, measurement.metrics if limits.stop_on_crash else None)
+            processes = RealtimeSupervisor(self.agents, channel, measurement, self.progress.print_line)
+            channel.observe(watch, processes, shown)
+            try:
+                channel.run(watch)
+                ended.reason = ended.reason or channel.fell_behind
+                shown.show()
+            except (NodeError, MissionError) as error:  # the bridge has died: what was flown is there all the same
+                ended.reason = str(error)
+            finally:
+                channel.close()
+                self.progress.end()
+            ground.exchanging = False
+            with _second_interrupt() as urgent:  # first they land: what follows takes seconds
+                if ended.stop.count > 1:
+                    urgent.append(signal.SIGINT)
+                if ended:
+                    ground.order_landing()  # before the agents end: no vehicle flies on without them
+                self.agents.stop()
+                ground.land(urgent)
+            set_ordinary_thread()  # the bridge does not: it has to watch them
+            summary = flight.write_results(
+                options.pictures and not ended, backend="cflib", cut_short=ended.reason, not_landed=ground.flying,
+                vehicles=ground.log.diagnostics,
+            )  # fmt: skip
+            return Flight(summary, flight.scenario, measurement.positions.array(), self.directory / BAG)
+        finally:
+            node.destroy_node()
+
+    def end(self) -> None:
         """All land, agents before; then the bridge ends, then the recorder closes its bag."""
-        mission = self._mission
         with _second_interrupt() as urgent:
             self.agents.stop()
-            if mission is not None:
-                mission.land(urgent)
-                mission.close()
+            if self.ground is not None:
+                self.ground.land(urgent)
+                self.ground.close()
             try:
-                if not self._attach:
+                if not self.attach:
                     child = self.bridge.all[0]  # it lands all that may still fly, then closes its links
                     if not end_process(child.process, BRIDGE_END_S):
                         raise MissionError(f"{describe_end(child)}: it did not end by itself")
             finally:
-                end_process(self._recorder.all[0].process, RECORDER_END_S)
-                bag = self._directory / MISSION_BAG
+                end_process(self.recorder.all[0].process, RECORDER_END_S)
+                bag = self.directory / MISSION_BAG
                 if not (bag / "metadata.yaml").is_file():
                     self.progress.print_line(
                         f"the recorder did not close {bag}: `{program()} recover {bag}` saves what it holds"
                     )
-                if mission is not None:
-                    mission.log.write(self._directory, ended.reason)
+                if self.ground is not None:
+                    self.ground.log.write(self.directory, self.ended.reason)
         self.progress.end()
         self.context.try_shutdown()
 
 
 def fly_crazyflies(
-    run: RunConfig,
-    settings: SwarmSettings,
-    swarm_yaml: Path,
-    out: str | Path,
-    options: FlightOptions,
-    stop: Stop,
-    *,
-    attach: bool = False,
-    page: PageOptions | None = None,
-) -> tuple[Flight, str]:
+    run: RunConfig, settings: SwarmSettings, swarm_yaml: Path, out: str | Path, options: FlightOptions, stop: Stop, *,
+    attach: bool = False, page: PageOptions | None = None,
+) -> tuple[Flight, str]:  # fmt: skip
     """One mission. When this returns or raises, all have landed (or were stopped) and no process is left.
 
     :param settings: the swarm's YAML, read; `swarm_yaml` is its path.
@@ -196,17 +225,15 @@ def fly_crazyflies(
         environment = run_environment(domain, directory / "log")
         if page is not None:
             shown.enter_context(view_process(domain, environment, page))
-        station, ended = _MissionProcesses(settings, directory, environment, attach), StopToken(stop)
-        station.start(swarm_yaml)
+        mission = _Mission(run, settings, directory, environment, stop, attach)
+        mission.start(swarm_yaml)
         try:
-            run, mission = station.take_off(run, scenario, domain, ended)
-            flight = _exchange(station, run, directory, options, ended, mission)
-            return flight, ended.reason
+            return mission.exchange(mission.take_off(scenario, domain), options), mission.ended.reason
         except DtsaError as error:
-            ended.reason = ended.reason or str(error)
+            mission.ended.reason = mission.ended.reason or str(error)
             raise
         finally:
-            station.end(ended)
+            mission.end()
 
 
 @contextmanager
@@ -226,54 +253,3 @@ def _second_interrupt() -> Iterator[list[int]]:
 def below(priority: int, steps: int) -> int:
     """A real-time priority below the bridge's; 0: none."""
     return max(priority - steps, min(priority, 1))
-
-
-def _exchange(
-    station: _MissionProcesses,
-    run: RunConfig,
-    directory: Path,
-    options: FlightOptions,
-    ended: StopToken,
-    mission: GroundStation,
-) -> Flight:
-    agents, progress = station.agents, station.progress
-    node = Node("channel", namespace=names.SWARM, context=station.context)
-    try:
-        declare_channel(node, run.air)
-        stop_on_crash = run.limits.stop_on_crash
-        run = dataclasses.replace(run, limits=dataclasses.replace(run.limits, stop_on_crash=False))
-        flight = RecordedFlight(node, run, directory, options.startup_s, answer_s=2.0, end_s=END_S)
-        channel, measurement = flight.channel, flight.measurement
-        assert isinstance(channel, RealtimeChannel)
-        shown = FlightProgress(progress, measurement, channel)
-        watch = MissionWatch(mission, channel, measurement.metrics if stop_on_crash else None)
-        channel.observe(watch, RealtimeSupervisor(agents, channel, measurement, progress.print_line), shown)
-        try:
-            channel.run(watch)
-            ended.reason = ended.reason or channel.fell_behind
-            shown.show()
-        except (NodeError, MissionError) as error:  # the bridge has died: what was flown is there all the same
-            ended.reason = str(error)
-        finally:
-            channel.close()
-            progress.end()
-        mission.exchanging = False
-        with _second_interrupt() as urgent:  # first they land: what follows takes seconds
-            if ended.stop.count > 1:
-                urgent.append(signal.SIGINT)
-            if ended:
-                mission.order_landing()  # before the agents end: no vehicle flies on without them
-            agents.stop()
-            mission.land(urgent)
-        set_ordinary_thread()  # the bridge does not: it has to watch them
-        pictures = options.pictures and not ended
-        summary = flight.write_results(
-            pictures,
-            backend="cflib",
-            cut_short=ended.reason,
-            not_landed=mission.flying,
-            vehicles=mission.log.diagnostics,
-        )
-        return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
-    finally:
-        node.destroy_node()

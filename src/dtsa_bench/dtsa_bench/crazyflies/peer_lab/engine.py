@@ -134,10 +134,9 @@ class Engine:
     def boot(
         self, vehicle: int, app: Path, now_ns: int, drift_ppb: int, address: int, channel: int, speed: int
     ) -> None:
-        """Switch a vehicle on, with a copy of the app that no other one has; address, channel and speed of its radio.
+        """Switch a vehicle on, with a copy of the app that no other one has; AppError: it cannot be loaded.
 
-        :param drift_ppb: by so much its clock is fast.
-        :raises AppError: the app cannot be loaded.
+        :param drift_ppb: by so much its clock is fast. :param address: of its radio, as channel and speed.
         """
         wrong = self._library.lab_boot(vehicle, str(app).encode(), now_ns, 0, drift_ppb, address, channel, speed)
         if wrong:

@@ -47,15 +47,15 @@ _TAKE_OFF, _LAND = 7, 8  # packets of the high-level commander
 class Laboratory:
     """Apps that fly. One process has one at a time; a crash of an app ends the process with a line that names it.
 
-    :param settings: vehicles, air and ground.
     :param out: directory for files; None: none are written.
-    :param observers: look on beside the record.
+    :param observers: look on beside the record. :param air: with other radios; `first`: id on it of the first vehicle.
     :raises CompileError: the app does not compile.
     """
 
     def __init__(
-        self, app: App, settings: LabSettings | None = None, out: Path | None = None, observers: Sequence[Observer] = ()
-    ) -> None:
+        self, app: App, settings: LabSettings | None = None, out: Path | None = None,
+        observers: Sequence[Observer] = (), air: RadioAir | None = None, first: int = 1,
+    ) -> None:  # fmt: skip
         self.settings = settings = settings or LabSettings()
         self.app = app
         self.now_ns = 0
@@ -80,10 +80,11 @@ class Laboratory:
         self.motion = FleetMotion(config, self._report)
         self.peers = [CrtpPeer(*both) for both in zip(self.motion.firmware, self.motion.estimates, strict=True)]
         streams = np.random.SeedSequence(settings.seed).spawn(2)
-        self._open_air(int(streams[0].generate_state(1)[0]))
-        self.agenda = self.air.agenda
+        # Without one given: all vehicles, a ground station and a foreign radio.
+        self.air = air or RadioAir(count + 2, settings.loss, int(streams[0].generate_state(1)[0]))
+        self.agenda, self._first = self.air.agenda, first
         self._lines = Lines(airtime, count)
-        self.overflows = [0] * count  # receptions that found a radio's queue full
+        self.overflows = np.zeros(count, np.int64)  # receptions that found a radio's queue full
         self._handed: list[deque[PeerPacket]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
         #: What an app sends to the ground: s, id, packet of the app channel.
         self.from_apps: list[tuple[float, int, bytes]] = []
@@ -98,11 +99,6 @@ class Laboratory:
         for k, start in enumerate(starts):
             self.at(start / 1e9, lambda k=k: self.switch_on(k + 1))  # type: ignore[misc]
         self.agenda.at(TICK_NS, self._tick)
-
-    def _open_air(self, seed: int) -> None:
-        """Make the air with all vehicles, a ground station and a foreign radio."""
-        self.air = RadioAir(self.settings.agents + 2, self.settings.loss, seed)
-        self._first = 1  # id on the air of the first vehicle
 
     def __enter__(self) -> Laboratory:
         return self
@@ -124,18 +120,11 @@ class Laboratory:
         return self.now_ns / 1e9
 
     def at(self, time_s: float, action: Callable[[], None]) -> None:
-        """Let the ground do something at an instant.
-
-        :param time_s: s, now or later.
-        :param action: what it does; it may call all that is below.
-        """
+        """Let the ground do something at an instant (s, now or later); it may call all that is below."""
         self.agenda.at(max(self.now_ns, round(time_s * 1e9)), action)
 
     def run(self, until_s: float) -> None:
-        """Fly on.
-
-        :raises AppError: an app did what no app may do.
-        """
+        """Fly on; AppError: an app did what no app may do."""
         until_ns = round(until_s * 1e9)
         while True:
             due = self.agenda.next_ns
@@ -156,7 +145,7 @@ class Laboratory:
             "app": self.app.name,
             "seed": self.settings.seed,
             **self.record.summary(self.now_ns),
-            "queue_overflows": sum(self.overflows),
+            "queue_overflows": int(self.overflows.sum()),
             "polls_answered": self.polling.answered if self.polling else None,
         }
 
@@ -279,9 +268,8 @@ class Laboratory:
     def _hand_over(self, now_ns: int, length: int, received: Mask) -> list[int]:
         """Radios that have received something hand it over, if their queues have room; the ids of these."""
         taken, _ = self._lines.receive(now_ns, length, received)
-        for k in np.flatnonzero(received & ~taken).tolist():
-            self.overflows[k] += 1
-        return [int(k) + 1 for k in np.flatnonzero(taken)]
+        self.overflows += received & ~taken
+        return (np.flatnonzero(taken) + 1).tolist()
 
     def receive_poll(self, agent: int, t: float) -> None:
         """A packet of a ground station has come to a radio, at t (s)."""
@@ -290,19 +278,15 @@ class Laboratory:
         self._hand_over(round(t * 1e9), 0, received)
 
     def _deliver(self, agent: int, now_ns: int, packet: PeerPacket, life: int) -> None:
-        k = agent - 1
+        k, rssi = agent - 1, _FOREIGN_RSSI
         if life != self._power_cycles[k]:
             return  # its power was off meanwhile
-        if self._engine.receive(k, now_ns, packet.raw, self._rssi(packet.sender, k)):
+        if packet.sender:  # by the distance, without fading
+            position = self.motion.vehicles.position
+            distance = float(np.linalg.norm(position[:, packet.sender - 1] - position[:, k]))
+            rssi = round(_NEAR_RSSI + 20.0 * math.log10(max(_NEAREST_M, distance)))
+        if self._engine.receive(k, now_ns, packet.raw, rssi):
             self._handed[k].append(packet)
-
-    def _rssi(self, sender: int, k: int) -> int:
-        """Strength of a reception, in -dBm: by the distance, without fading."""
-        if not sender:
-            return _FOREIGN_RSSI
-        position = self.motion.vehicles.position
-        distance = max(_NEAREST_M, float(np.linalg.norm(position[:, sender - 1] - position[:, k])))
-        return round(_NEAR_RSSI + 20.0 * math.log10(distance))
 
     def is_on(self, agent: int) -> bool:
         """Whether a vehicle is switched on."""
@@ -372,10 +356,7 @@ class Laboratory:
         return {name: self._engine.get(k, name, parameter=False) for name in self._engine.names(k, parameters=False)}
 
     def send(self, agent: int, data: bytes) -> bool:
-        """A packet of the app channel; False: the app's queue of ten is full.
-
-        :raises ConfigError: it is too long.
-        """
+        """A packet of the app channel (at most 30 bytes); False: the app's queue of ten is full."""
         if len(data) > 30:
             raise ConfigError("app channel", len(data), "at most 30 bytes")
         k = self._index(agent)

@@ -43,8 +43,8 @@ class _AgentFlight:
     """What one agent has noted, and its bag."""
 
     def __init__(self, agent: int, config: SwarmConfig, path: Path) -> None:
-        goals_told, started_ns = not config.targets_known, 0  # the vehicle's clock begins when it is switched on
-        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _PeerPort(), goals_told, started_ns)
+        # The vehicle's clock begins when it is switched on.
+        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _PeerPort(), not config.targets_known, 0)
         self._record: SlotRecord | None = None
         self._before: list[ReceivedFrame] = []
         self._slots = config.steps
@@ -83,10 +83,10 @@ class _AgentFlight:
             self._recorder.slot(self._record)
             self._record = None
 
-    def finish(self, summary: dict[str, Any]) -> None:
+    def finish(self) -> None:
         """The flight is over."""
         self.close_slot()
-        self._recorder.finish(summary)
+        self._recorder.finish({"ended": True})
         self._recorder.__exit__()
 
 
@@ -94,7 +94,6 @@ class OnboardSwarm:
     """A swarm that flies the protocol on board, and its ground.
 
     :param swarm: what all agents share; the app has the defaults of the rest.
-    :param lab: vehicles, air and ground.
     :param out: directory for bags; None: none are made.
     :param key: 16 bytes, of sealed frames.
     :param enable_s: s, when the agents may steer; None: the ground is not played here.
@@ -103,14 +102,9 @@ class OnboardSwarm:
     """
 
     def __init__(
-        self,
-        swarm: SwarmConfig,
-        lab: LabSettings,
-        out: Path | None = None,
-        key: bytes = b"",
-        enable_s: float | None = 8.0,
-        app: App | None = None,
-    ) -> None:
+        self, swarm: SwarmConfig, lab: LabSettings, out: Path | None = None, key: bytes = b"",
+        enable_s: float | None = 8.0, app: App | None = None, make: Callable[..., Laboratory] = Laboratory,
+    ) -> None:  # fmt: skip
         check_onboard_swarm(swarm)
         if swarm.auth and len(key) != KEY_BYTES:
             raise ConfigError("key", len(key) or "none", f"{KEY_BYTES} bytes on board")
@@ -118,19 +112,15 @@ class OnboardSwarm:
         start = np.array(self.scenario.start)
         start[2] = 0.0  # on the floor
         settings = dataclasses.replace(lab, agents=swarm.agents, start=start)
-        self.lab = self._make_laboratory(app or read_app(APP), settings, out)
-        self._flights = [
-            None if out is None else _AgentFlight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
-        ]
+        self.lab = make(app or read_app(APP), settings, out, [self.observe])
+        ids = range(1, swarm.agents + 1)
+        self._flights = [] if out is None else [_AgentFlight(k, swarm, out / f"cf{k}.mcap") for k in ids]
         self._key = key
         if enable_s is None:
             return
-        for agent in range(1, swarm.agents + 1):
+        for agent in ids:
             self.lab.at(settings.boot_s + 0.1, lambda agent=agent: self.prepare(agent))  # type: ignore[misc]
             self._climb(agent, HEIGHT_M + float(self.scenario.start[2, agent - 1]), enable_s)
-
-    def _make_laboratory(self, app: App, settings: LabSettings, out: Path | None) -> Laboratory:
-        return Laboratory(app, settings, out, [self.observe])
 
     def _at(self, time_s: float, action: Callable[..., object], *given: Any) -> None:
         self.lab.at(time_s, lambda: action(*given) and None)
@@ -159,8 +149,8 @@ class OnboardSwarm:
 
     def observe(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
         """What an app has noted goes into its bag."""
-        if kind == "record" and (flight := self._flights[agent - 1]) is not None:
-            flight.note(content)
+        if kind == "record" and self._flights:
+            self._flights[agent - 1].note(content)
 
     def __enter__(self) -> OnboardSwarm:
         return self
@@ -172,8 +162,6 @@ class OnboardSwarm:
         """The flight is over: bags are closed; what came of it."""
         goal = np.array(self.scenario.target) + _UP
         away = np.sqrt(((goal - self.lab.motion.vehicles.position) ** 2).sum(axis=0))
-        summary = {**self.lab.summary(), "away_m": [round(float(x), 3) for x in away]}
         for flight in self._flights:
-            if flight is not None:
-                flight.finish({"ended": True})
-        return summary
+            flight.finish()
+        return {**self.lab.summary(), "away_m": [round(float(x), 3) for x in away]}

@@ -32,8 +32,8 @@ class Polling:
             air.receivers[agent] = receiver
         self._stations = [receiver.station for receiver in air.receivers.values()]
         self._dongle = DongleModel(count + 1, RadioSettings(seed=settings.seed, request_ms=0.0), air)
-        self._dongle.request(SET_CHANNEL, settings.channel, 0, b"", 0)
-        self._dongle.request(SET_RATE, RATE_NAMES.index(settings.rate), 0, b"", 0)
+        self._dongle.request(SET_CHANNEL, settings.channel, b"", 0)
+        self._dongle.request(SET_RATE, RATE_NAMES.index(settings.rate), b"", 0)
         self._gap_ns = round(1e9 / (settings.polls * count))
         self._next = 0
         self._busy = False
@@ -52,7 +52,7 @@ class Polling:
         station = self._stations[self._next]
         self._next = (self._next + 1) % len(self._stations)
         self._busy = True
-        self._dongle.request(SET_ADDRESS, 0, 0, station.address, now)
+        self._dongle.request(SET_ADDRESS, 0, station.address, now)
         self._dongle.transfer(_POLL, now, self._answer)
 
     def _answer(self, data: bytes) -> None:

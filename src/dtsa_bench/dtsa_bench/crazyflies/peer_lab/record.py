@@ -82,10 +82,7 @@ _CODES = {"sent": 0, "heard": 1, "command": 2, "print": 20, "event": 21, "positi
 
 
 class Record:
-    """Counts, ages, distances, and the digest of all of it; with a directory, a file of all packets.
-
-    :param addressed: as of `App`: which packets tell a receiver its sender's state.
-    """
+    """Counts, ages, distances, and the digest of all of it; with a directory, a file of all packets."""
 
     def __init__(self, agents: int, addressed: bool, directory: Path | None = None) -> None:
         self._addressed, self._ages, self._digest = addressed, StateAges(agents), hashlib.sha256()

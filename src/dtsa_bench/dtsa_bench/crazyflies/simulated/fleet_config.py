@@ -115,10 +115,6 @@ class FleetConfig(Settings):
         if self.radio.path is not None and len(self.radio.stations) != self.count:
             raise ConfigError("radio", len(self.radio.stations), f"a station for each of {self.count} vehicles")
 
-    def arms_itself(self, index: int) -> bool:
-        """Whether the vehicle with this index does not wait to be armed."""
-        return self.arming == "auto" or (self.arming == "mixed" and index % 2 == 0)
-
     @property
     def uris(self) -> list[str]:
         """Where cflib finds them."""

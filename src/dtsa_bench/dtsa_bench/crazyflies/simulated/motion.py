@@ -63,8 +63,11 @@ class FleetMotion:
         self._report = report
         vehicle = flight_model(config.model).vehicle
         self.vehicles = Vehicles(config.start, vehicle)
+        arms_itself = [
+            config.arming == "auto" or (config.arming == "mixed" and k % 2 == 0) for k in range(config.count)
+        ]
         self.firmware = [
-            Firmware(partial(report, k), vehicle.tau, auto_arming=config.arms_itself(k)) for k in range(config.count)
+            Firmware(partial(report, k), vehicle.tau, auto_arming=auto) for k, auto in enumerate(arms_itself)
         ]
         self.estimates = [Estimate() for _ in range(config.count)]
         self._noise = np.random.default_rng(np.random.SeedSequence(config.seed).spawn(1)[0])

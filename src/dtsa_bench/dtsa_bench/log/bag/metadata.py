@@ -85,7 +85,7 @@ def open_file(path: Path) -> IO[bytes]:
     try:
         if path.suffix != ".zstd":
             return path.open("rb")
-        unpacked = TemporaryFile()
+        unpacked = TemporaryFile()  # noqa: SIM115  the caller closes it
         with path.open("rb") as packed, suppress(zstandard.ZstdError):  # of a damaged file the beginning is unpacked
             reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
             while block := reader.read(1 << 20):

@@ -37,9 +37,7 @@ MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
 _END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
 _ROS = "cdr/ros2msg"
-_MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
 NOT_OF_ITS_TYPE = (SerdeError, AssertionError, IndexError, KeyError, ValueError, struct.error)  # of rosbags
-_ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
 
 class BagMessage(NamedTuple):
@@ -85,8 +83,9 @@ class Bag:
             for part in self._paths:
                 reader = self._add_file(part, stack.enter_context(metadata.open_file(part)))
                 with suppress(Exception):  # of a damaged record: whatever the library meets, there is none then
-                    named = (one for one in reader.iter_metadata() if one.name == metadata.RECORD_NAME)
-                    records = [metadata.load_record(one) for one in named][::-1] + records
+                    for record in reader.iter_metadata():
+                        if record.name == metadata.RECORD_NAME:
+                            records.insert(0, metadata.load_record(record))
             if self.topics and all(topic.encoding != _ROS for topic in self.topics.values()):
                 topic = next(iter(self.topics.values()))
                 why = f"topic {topic.name} is recorded as {topic.encoding}, not as {_ROS}: not a ROS 2 bag"
@@ -130,8 +129,6 @@ class Bag:
 
     def _add_topic(self, channel: Channel, schema: Schema | None, count: int) -> None:
         definition, before = definition_of(channel, schema), self.topics.get(channel.topic)
-        if definition.name.startswith(_ON_A_NETWORK):
-            raise UnusableBag(self.given, _MERGED.format(program()))
         profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
         self.topics[channel.topic] = Topic(
             channel.topic, definition.name, count + (before.count if before else 0),

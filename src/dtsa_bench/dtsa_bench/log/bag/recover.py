@@ -65,8 +65,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
     """Save all messages of a damaged bag that can be read to a new one.
 
     :param path: the damaged bag: run directory, bag directory or .mcap file. It is only read.
-    :param directory: where the new bag is made; None: beside the old one, with `_recovered` appended to
-        its name.
+    :param directory: where the new bag is made; None: beside the old one, with `_recovered` appended to its name.
     :raises ConfigError: if the new directory is in use, or nothing at all can be read.
     :raises BagError: if the new bag cannot be written.
     """
@@ -105,12 +104,12 @@ def _begin(files: list[RecordScan], given: str | Path) -> tuple[str, dict[str, A
     """
     profile, about = "", metadata.read_beside(files[0].path, given)
     for file in files:
-        about, channels = {**about, **file.about}, set(file.summary.channels)
+        about, channels = about | file.about, set(file.summary.channels)
         for record in file.records():
             if isinstance(record, Header):
                 profile = record.profile
             elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
-                about = {**about, **metadata.load_record(record)}
+                about |= metadata.load_record(record)
             elif isinstance(record, Channel):
                 channels.add(record.id)
             elif isinstance(record, Message) and record.channel_id in channels:
@@ -218,33 +217,30 @@ class _Copy:
         targets: dict[int, int] = {}  # channels of the new bag by those of the file; 0: none
         for record in file.records():
             if isinstance(record, Message):
-                if record.channel_id not in targets:  # its channel stands where the file is damaged
-                    targets[record.channel_id] = self._channel(channels.get(record.channel_id), schemas)
-                self._write(targets[record.channel_id], record)
+                number = record.channel_id
+                if number not in targets:  # its channel stands where the file is damaged
+                    targets[number] = self._channel(channels.get(number), schemas)
+                try:
+                    data = self._unpack(record.data)
+                except (ZstdError, MemoryError):
+                    self.lost["messages cannot be unpacked"] += 1
+                    continue
+                if targets[number]:
+                    self._writer.write(targets[number], data, record.log_time, record.publish_time, record.sequence)
+                else:
+                    self.lost["messages belong to topics that are not defined"] += 1
             elif isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
                 channels[record.id] = record
                 targets[record.id] = self._channel(record, schemas)
-            elif isinstance(record, Metadata) and record.name != metadata.RECORD_NAME:
-                self._writer.add_metadata(record.name, record.metadata)
             elif isinstance(record, Metadata):
-                last = metadata.custom_data(metadata.load_record(record))
-                if KEY in last:  # the new bag gets a digest of its own
-                    self._writer.custom_data[f"recovered_{KEY}"] = last[KEY]
+                if record.name != metadata.RECORD_NAME:
+                    self._writer.add_metadata(record.name, record.metadata)
+                elif KEY in (last := metadata.custom_data(metadata.load_record(record))):
+                    self._writer.custom_data[f"recovered_{KEY}"] = last[KEY]  # the new bag gets one of its own
         for number, count in file.counts.items():
             self.expected[channels[number].topic if number in channels else "?"] += count
-
-    def _write(self, channel: int, record: Message) -> None:
-        try:
-            data = self._unpack(record.data)
-        except (ZstdError, MemoryError):
-            self.lost["messages cannot be unpacked"] += 1
-            return
-        if channel:
-            self._writer.write(channel, data, record.log_time, record.publish_time, record.sequence)
-        else:
-            self.lost["messages belong to topics that are not defined"] += 1
 
     def _channel(self, channel: Channel | None, schemas: Mapping[int, Schema]) -> int:
         """The new bag's channel for one of the file; 0: it is not defined, or its topic has another type already."""

@@ -37,14 +37,9 @@ class Player:
     """
 
     def __init__(
-        self,
-        bag: Bag,
-        output: Any,
-        rate: float = 1.0,
-        start_s: float = 0.0,
-        loop: bool = False,
+        self, bag: Bag, output: Any, rate: float = 1.0, start_s: float = 0.0, loop: bool = False,
         topics: Collection[str] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         duration = (bag.end_ns - bag.start_ns) / 1e9
         if not 0 < rate <= 1000:
             raise ConfigError("rate", rate, "above 0, at most 1000")
@@ -60,10 +55,7 @@ class Player:
         self._begin_ns = self._next_clock_ns = self._next_poll_ns = 0  # wall time
 
     def play(self, poll: Callable[[Player], None] | None = None) -> None:
-        """Play to the end; blocks.
-
-        :param poll: called some fifty times a second: may pause, stop or show the progress.
-        """
+        """Play to the end; `poll` is called some fifty times a second: may pause, stop or show the progress."""
         while not self.stopped:
             self._begin_ns = self._next_clock_ns = 0
             for message in self._bag.messages(self._topics, self._from_ns):
@@ -82,8 +74,7 @@ class Player:
 
     def _publish_clock(self, time_ns: int) -> None:
         self._output.clock(time_ns)
-        self.time_ns = time_ns
-        self._next_clock_ns = time.monotonic_ns() + CLOCK_NS
+        self.time_ns, self._next_clock_ns = time_ns, time.monotonic_ns() + CLOCK_NS
 
     def _wait(self, time_ns: int, poll: Callable[[Player], None] | None) -> None:
         """Wait until a simulated time is due; `/clock` and `poll` go on meanwhile."""
@@ -130,11 +121,9 @@ class RosOutput:
             except (BagError, ImportError, AttributeError) as error:
                 warn(f"{topic.name} is left out: {error}")
                 continue
-            if topic.type_hash and topic.type_hash != installed.type_hash:
-                raise BagError(
-                    f"{topic.name}: the bag's {topic.type} differs from the installed one "
-                    f"({topic.type_hash} / {installed.type_hash}); leave it out with --topics"
-                )
+            if topic.type_hash not in ("", installed.type_hash):
+                hashes = f"({topic.type_hash} / {installed.type_hash}); leave it out with --topics"
+                raise BagError(f"{topic.name}: the bag's {topic.type} differs from the installed one {hashes}")
             try:
                 profile = ros_profile(topic.profiles, topic.count)
                 self._publishers[topic.name] = node.create_publisher(kind, topic.name, profile)

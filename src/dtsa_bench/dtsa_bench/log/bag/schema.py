@@ -35,13 +35,6 @@ class Definition:
     message_encoding: str = "cdr"
 
 
-def _dependencies(text: str, package: str) -> list[str]:
-    """Types of messages that a definition names, in order of appearance."""
-    names = (match[1] for line in text.splitlines() if (match := _FIELD.match(line)))
-    types = (name.rpartition("/") for name in names if not _PRIMITIVE.fullmatch(name))
-    return [f"{owner.partition('/')[0] or package}/msg/{short}" for owner, _, short in types]
-
-
 def concatenate(name: str, text_of: Callable[[str], str]) -> str:
     """Definition of a type with all that it needs, as rosbag2 stores it in a schema.
 
@@ -51,9 +44,12 @@ def concatenate(name: str, text_of: Callable[[str], str]) -> str:
     waiting = [name]
     while waiting:
         kind = waiting.pop(0)
-        if kind not in texts:
-            texts[kind] = text_of(kind)
-            waiting += _dependencies(texts[kind], kind.split("/")[0])
+        if kind in texts:
+            continue
+        texts[kind], package = text_of(kind), kind.partition("/")[0]
+        named = (match[1] for line in texts[kind].splitlines() if (match := _FIELD.match(line)))
+        needed = (field.rpartition("/") for field in named if not _PRIMITIVE.fullmatch(field))
+        waiting += [f"{owner.partition('/')[0] or package}/msg/{short}" for owner, _, short in needed]
     root = texts.pop(name)
     return "\n".join([root, *(f"{SEPARATOR}\nMSG: {kind.replace('/msg', '')}\n{text}" for kind, text in texts.items())])
 

@@ -57,9 +57,9 @@ class _Channel:
 class BagWriter:
     """One bag directory being recorded. For one thread; a context manager.
 
-    :param directory: where the bag is made; must not exist, or be empty. Parents are made. Or the name of an .mcap file,
-        for a bag that is this file alone.
-    :param config: configuration of the run, JSON types only; None: the bag says nothing of its origin but `custom_data`.
+    :param directory: where the bag is made; empty, or not there yet. Or the name of an .mcap file, for a bag of
+        this file alone.
+    :param config: configuration of the run, JSON types; None: the bag says nothing of its origin but `custom_data`.
     :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
     :param chunk_size: bytes, size at which a chunk is closed even if its half second is not over.
     :param min_time_ns: ns, earliest log time that is accepted.
@@ -119,11 +119,6 @@ class BagWriter:
         self._next_flush = monotonic() + FLUSH_S
 
     @property
-    def message_count(self) -> int:
-        """Messages written so far."""
-        return sum(channel.count for channel in self._channels)
-
-    @property
     def counts(self) -> dict[str, int]:
         """Messages written so far, by topic."""
         return {channel.topic: channel.count for channel in self._channels}
@@ -134,23 +129,18 @@ class BagWriter:
         return (self._start_ns, self._end_ns) if self._start_ns <= self._end_ns else (0, 0)
 
     def add_topic(
-        self,
-        topic: str,
-        type_name: str,
-        qos: str | Sequence[metadata.Profile] = "reliable",
+        self, topic: str, type_name: str, qos: str | Sequence[metadata.Profile] = "reliable",
         definition: Definition | None = None,
-    ) -> int:
+    ) -> int:  # fmt: skip
         """Announce a topic, at any time before its first message; return the channel for `write`.
 
         :param qos: name from `metadata.PROFILES`, or the profiles that its publishers offer.
         :param definition: message definition and type hash; None: those of the installed type.
-        :raises ConfigError: if the topic is there already or the QoS name is unknown.
+        :raises ConfigError: if the topic is there already.
         """
         self._check_open()
         if any(channel.topic == topic for channel in self._channels):
             raise ConfigError("topic", topic, "a name that is not in the bag yet")
-        if isinstance(qos, str) and qos not in metadata.PROFILES:
-            raise ConfigError("qos", qos, ", ".join(metadata.PROFILES))
         profiles = [metadata.PROFILES[qos]] if isinstance(qos, str) else list(qos)
         definition = definition or installed(type_name)
         schema = self._schemas.get(definition, 0)  # 0: a channel without one
@@ -242,7 +232,7 @@ class BagWriter:
         start_ns, end_ns = self.time_range_ns
         extent = {
             "starting_time": {"nanoseconds_since_epoch": start_ns}, "duration": {"nanoseconds": end_ns - start_ns},
-            "message_count": self.message_count,
+            "message_count": sum(self.counts.values()),
         }  # fmt: skip
         topics = [
             {

@@ -6,31 +6,37 @@ import dataclasses
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dtsa_agent.air.record import SlotRecord
+from dtsa_agent.air.port import frame_in
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.agent_bag import AgentBag
-from dtsa_bench.log.arrays import FlightArrays
+from dtsa_bench.log.arrays import DECIDED, UNKNOWN, VECTORS, FlightArrays, ReceivedFrames, empty_arrays, split_log
+from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
-from dtsa_bench.log.merged_flight import MergedReplay, check_rules
+from dtsa_bench.log.merged_flight import MergedReplay, check_rules, run_of
 from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.delivery import counts_of_datagrams
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
-from .join import join
-from .timeline import Clock, Crossing, Process, TimeLine, fit, process_name
+from .timeline import Clock, Crossings, Process, TimeLine, fit, process_name
 
 _END = 50  # slots
+_SECTIONS = ("swarm", "limits", "mode")  # of the configuration: there is no simulated channel, and no simulated clocks
+
+Processes = Mapping[Process, AgentBag]
+ToCommon = Callable[[NDArray[np.int64]], NDArray[np.int64]]  # times of a process's own clock to the common line, ns
 
 
 class SentDatagram(NamedTuple):
     """A datagram that was handed to the network."""
 
     process: Process
-    record: SlotRecord
+    sent_ns: int  # own clock
+    data: bytes
 
 
 class Merge:
@@ -44,11 +50,10 @@ class Merge:
         self.nothing_written = list(nothing_written)
         self.config = bags[0].swarm
         self.sent = _sent_datagrams(self.processes)
-        self.unmatched, self._crossings = _crossings(self.processes, self.sent, not self.nothing_written)
-        kept = [one for one in self._crossings if one.sender[1] >= 0 and one.receiver[1] >= 0]
-        self.line = fit(kept, bags[0].flight_ns)
+        self.heard_count, self.unmatched, crossings = _crossings(self.processes, self.sent, not self.nothing_written)
+        self.line = fit(sorted(self.processes), crossings, bags[0].flight_ns)
         self.apart = _groups_apart(self.processes, self.line)
-        self._starts = _SlotStarts(self.processes, self.line, self.config.slot_ns)
+        self._starts = _SlotStarts(self.processes, self.line.clocks, self.config.slot_ns)
 
     @cached_property
     def log(self) -> FlightLog:
@@ -57,45 +62,45 @@ class Merge:
         :raises ConfigError: if there is no such slot.
         :raises BagError: if most slots are missing.
         """
-        first, clocks = self._starts.common_slot, self.line.clocks
-        if first is None and len(self.processes) == 1:  # there is nothing to compare the one clock with
+        starts, clocks = self._starts, self.line.clocks
+        if starts.common_slot is None and len(self.processes) == 1:  # there is nothing to compare the one clock with
             ((process, bag),) = self.processes.items()
-            first, clocks = bag.slots[0].slot, {process: Clock(bag.slots[0].start_ns, 0.0, 0.0)}
-        if first is None:
-            count, why = len(self.processes), "bags of agents that hear each other and come to count slots alike"
+            clocks = {process: Clock(int(bag.log.start_ns[0]), 0.0, 0.0)}
+            starts = _SlotStarts(self.processes, clocks, self.config.slot_ns)
+        if starts.common_slot is None:
+            why = "bags of agents that hear each other and come to count slots alike"
             if self.apart:
                 why = f"bags of one flight on one time line; {clocks_apart(self.apart)}"
-            raise ConfigError("bags", count, why)
-        on_line = {process: bag for process, bag in self.processes.items() if process in clocks and bag.slots}
-        slot_ns, (zero, length) = self.config.slot_ns, _line_of_slots(on_line, clocks, first, self.config.slot_ns)
-
-        def to_common_time(clock: Clock) -> Callable[[int], int]:
-            return lambda own_ns: round((clock.common_ns(own_ns) - zero) * slot_ns / length)
-
-        times = {process: to_common_time(clocks[process]) for process in on_line}
+            raise ConfigError("bags", len(self.processes), why)
+        zero_ns, slot_ns = starts.line()
         summary = self.line.summary()
         about = {
             **self._about_bags(),
             "frames_heard_not_as_sent": self.unmatched,
             "residual_us": {name: value or 0.0 for name, value in summary["residual_us"].items()},
             "clocks": summary["clocks"],
-            "slot_on_the_first_clock_ns": length,
+            "slot_on_the_first_clock_ns": slot_ns,
             "agents_that_gave_up_a_time": sorted({agent for agent, number in self.processes if number < 0}),
         }
-        return join(on_line, times, first, round(self.line.flight_ns), about)
+        on_line = {process: self.processes[process] for process in clocks if len(self.processes[process].log)}
+
+        def to_common(clock: Clock) -> ToCommon:
+            return lambda own_ns: np.rint(
+                (clock.common_ns(own_ns) - zero_ns) * self.config.slot_ns / slot_ns
+            ).astype(np.int64)  # fmt: skip
+
+        times = {process: to_common(clocks[process]) for process in on_line}
+        return _join(on_line, times, starts.common_slot, round(self.line.flight_ns), about)
 
     def _about_bags(self) -> dict[str, Any]:
-        here = {agent for agent, _ in self.processes}
+        here, line = {agent for agent, _ in self.processes}, self.line.clocks
         return {
             "missing": [agent for agent in range(1, self.config.agents + 1) if agent not in here],
             "broken_off": [process_name(process) for process, bag in self.processes.items() if bag.broken_off],
             "nothing_written": self.nothing_written,
-            "not_on_the_time_line": [
-                process_name(process) for process in self.processes
-                if process not in self.line.clocks and process[1] >= 0
-            ],
+            "not_on_the_time_line": [process_name(one) for one in self.processes if one not in line and one[1] >= 0],
             "not_determined": self.apart,
-        }  # fmt: skip
+        }
 
     def summary(self, air_ns: int = 0) -> dict[str, Any]:
         """What came of the flight, and whether all decisions follow from what each agent heard, as plain values.
@@ -108,36 +113,49 @@ class Merge:
         alone = [
             MergedReplay(_log_alone(process, bag)).run()  # slots of its own, which are nobody else's
             for process, bag in processes.items()
-            if bag.slots and not (has_common and process in line.clocks)
+            if len(bag.log) and not (has_common and process in line.clocks)
         ]
         replays = [*([joined] if joined else []), *alone]
         refused: Counter[str] = sum((bag.refused for bag in processes.values()), Counter())
-        slots, here = max(len(bag.slots) for bag in processes.values()), {agent for agent, _ in processes}
-        heard = sum(len(record.before) + len(record.heard) for bag in processes.values() for record in bag.slots)
-        delivery = counts_of_datagrams(len(here), slots, len(self.sent), heard, refused)
+        lengths, here = [len(bag.slots) for bag in processes.values()], {agent for agent, _ in processes}
+        heard = sum(len(bag.heard.row) for bag in processes.values())
+        delivery = counts_of_datagrams(len(here), max(lengths), len(self.sent), heard, refused)
         held = {process_name(process): bag.summary.get("held_slots") for process, bag in processes.items()}
         rules = check_rules(self.log, joined.unsent) if joined else RuleChecker(self.config)
         return {
             "bags": sum(number >= 0 for _, number in processes),
-            "slots_of_times_given_up": sum(len(bag.slots) for (_, number), bag in processes.items() if number < 0),
+            "slots_of_times_given_up": sum(lengths[k] for k, (_, number) in enumerate(processes) if number < 0),
             **self._about_bags(),
             "time_line": line.summary(),
             **self._starts.summary(),
-            **_air(self.sent, line, air_ns, self._starts.common_slot),
+            **self._air(air_ns),
             "frames_unsent": sum(len(replay.unsent) for replay in replays),
             "unheard": delivery.problem(refused) or None,
-            "frames_heard": len(self._crossings),
+            "frames_heard": self.heard_count,
             "frames_heard_not_as_sent": self.unmatched,
             "turns": rules.summary(),
             "decisions_again": {
                 "equal": sum(replay.equal for replay in replays),
-                "of": sum(len(bag.slots) for bag in processes.values()),
+                "of": sum(lengths),
                 "differences": [one for replay in replays for one in replay.differences],
             },
             "not_taken_in": {process_name(p): dict(bag.refused) for p, bag in processes.items() if bag.refused},
             "held_slots": {name: count for name, count in held.items() if count},
             "never_flew": [process_name(p) for p, bag in processes.items() if bag.summary.get("never_flew")],
             "flight": joined.results if joined else None,
+        }
+
+    def _air(self, air_ns: int) -> dict[str, Any]:
+        """Two senders in a slot, and frames that were on the air together."""
+        double = [slot for slot, count in Counter(slot for slot, _ in self.sent).items() if count > 1]
+        common, clocks = self._starts.common_slot, self.line.clocks
+        after = sum(common is not None and slot >= common for slot in double)
+        at = [clocks[one.process].common_ns(one.sent_ns) for one in self.sent.values() if one.process in clocks]
+        return {
+            "frames_sent": len(self.sent),
+            "slots_with_two_senders": after,
+            "slots_with_two_senders_before": len(double) - after,
+            "overlapping_frames": int((np.diff(np.sort(at)) < air_ns).sum()) if air_ns else None,
         }
 
 
@@ -159,14 +177,13 @@ def clocks_apart(groups: Sequence[Sequence[str]]) -> str:
     return f"offsets of clocks not determined: frames do not go both ways between {named_groups}"
 
 
+# -- processes and what they share -----------------------------------------------------------------------------------
 def _processes(bags: Sequence[AgentBag]) -> dict[Process, AgentBag]:
     """The bags by agent and process."""
-    if not any(bag.slots for bag in bags):
+    if not any(len(bag.log) for bag in bags):
         raise ConfigError("bags", str(bags[0].path) if bags else "", "bags with a slot in them")
     found: dict[Process, AgentBag] = {}
-    times = {id(bag): _times(bag) for bag in bags}
-    last = [dataclasses.replace(bag, slots=times[id(bag)][-1]) for bag in bags]
-    for bag in sorted(last, key=lambda bag: (bag.agent, bag.slots[0].slot if bag.slots else -1)):
+    for bag in sorted(bags, key=lambda bag: (bag.agent, bag.log.first_slot if len(bag.log) else -1)):
         if bag.swarm != bags[0].swarm:
             theirs, ours = bag.swarm.to_dict(), bags[0].swarm.to_dict()
             other = ", ".join(
@@ -175,142 +192,222 @@ def _processes(bags: Sequence[AgentBag]) -> dict[Process, AgentBag]:
             raise ConfigError("bag", str(bag.path), f"one of the same flight as {bags[0].path}: {other}")
         number = sum(agent == bag.agent for agent, _ in found)
         before = found.get((bag.agent, number - 1))
-        if before is not None and before.slots and (not bag.slots or bag.slots[0].slot <= before.slots[-1].slot):
+        if before is not None and bag.log.first_slot < before.log.first_slot + len(before.log):
             raise ConfigError("bag", str(bag.path), f"one process of cf{bag.agent} at a time: {before.path} is another")
         found[(bag.agent, number)] = bag
     for bag in bags:  # what it flew before it took over a time with smaller numbers: processes of negative ones
-        earlier = dataclasses.replace(bag, summary={}, refused=Counter())
-        for slots in reversed(times[id(bag)][:-1]):
+        for log in reversed(bag.earlier):
             number = -1 - sum(agent == bag.agent and number < 0 for agent, number in found)
-            found[(bag.agent, number)] = dataclasses.replace(earlier, slots=slots)
+            found[(bag.agent, number)] = dataclasses.replace(bag, log=log, summary={}, refused=Counter())
     return found
 
 
-def _times(bag: AgentBag) -> list[list[SlotRecord]]:
-    """The slots of an agent, split where they count back: there it took over another time."""
-    starts = [0, *(k for k in range(1, len(bag.slots)) if bag.slots[k].slot <= bag.slots[k - 1].slot), len(bag.slots)]
-    return [bag.slots[a:b] for a, b in pairwise(starts)]
-
-
-def _log_alone(process: Process, bag: AgentBag) -> FlightArrays:
-    """The log of a process that shares no time line with others."""
-    nothing: dict[str, Any] = {"missing": [], "broken_off": [], "nothing_written": [], "not_on_the_time_line": []}
-    return join({process: bag}, {process: lambda own_ns: own_ns}, bag.slots[0].slot, 0, nothing)
-
-
-def _groups_apart(processes: Mapping[Process, AgentBag], line: TimeLine) -> list[list[str]]:
+def _groups_apart(processes: Processes, line: TimeLine) -> list[list[str]]:
     """The groups between which frames do not go both ways, by names; empty: it is one group.
 
     A process that sent nothing could not be heard: it makes no group, and is not on the time line either.
     """
     sharing = {process for group in line.groups for process in group}
     alone = [(process,) for process in processes if process not in sharing and process[1] >= 0]
-    groups = [
-        group for group in (*line.groups, *alone) if any(r.datagram for one in group for r in processes[one].slots)
-    ]
+    groups = [group for group in (*line.groups, *alone) if any(processes[one].log.sent.any() for one in group)]
     return [[process_name(process) for process in group] for group in groups] if len(groups) > 1 else []
 
 
-def _sent_datagrams(processes: Mapping[Process, AgentBag]) -> dict[tuple[int, int], SentDatagram]:
+def _sent_datagrams(processes: Processes) -> dict[tuple[int, int], SentDatagram]:
     """All datagrams that were sent, by slot and sender."""
-    return {
-        (record.slot, process[0]): SentDatagram(process, record)
-        for process, bag in sorted(processes.items())
-        for record in bag.slots
-        if record.datagram
-    }
+    sent = {}
+    for process, bag in sorted(processes.items()):
+        rows, _, datagrams, *_ = bag.log.sent_frames
+        for row, sent_ns, data in zip(rows.tolist(), bag.sent_ns.tolist(), datagrams, strict=True):
+            sent[bag.log.first_slot + row, process[0]] = SentDatagram(process, sent_ns, data)
+    return sent
 
 
 def _crossings(
-    processes: Mapping[Process, AgentBag], sent: Mapping[tuple[int, int], SentDatagram], complete: bool
-) -> tuple[int, list[Crossing]]:
-    """How many frames were heard that their sender's bag does not have, or has otherwise, and all others.
+    processes: Processes, sent: Mapping[tuple[int, int], SentDatagram], complete: bool
+) -> tuple[int, int, Crossings]:
+    """How many frames were heard as they were sent, how many their sender's bag does not have, and those of one time.
 
     :param complete: whether all that was sent is there.
     """
-    unmatched, crossings = 0, []
-    whole: set[int] = set()
-    if complete:
-        whole = {agent for agent, _ in processes} - {agent for (agent, _), bag in processes.items() if bag.broken_off}
+    whole = {agent for agent, _ in processes} - {agent for (agent, _), bag in processes.items() if bag.broken_off}
     earlier = _sent_datagrams({process: bag for process, bag in processes.items() if process[1] < 0})
+    numbers = {process: k for k, process in enumerate(sorted(processes))}
+    count = unmatched = 0
+    rows: list[tuple[int, int, int, int]] = []
     for receiver, bag in processes.items():
-        for record in bag.slots:
-            for heard in (*record.before, *record.heard):
-                origin = sent.get((heard.slot, heard.sender))
-                if origin is None or origin.record.datagram != heard.datagram:
-                    origin = earlier.get((heard.slot, heard.sender), origin)
-                if origin is not None and origin.record.datagram == heard.datagram:
-                    crossings.append(Crossing(origin.process, receiver, origin.record.sent_ns, heard.arrival_ns))
-                elif origin is not None or heard.sender in whole:
-                    unmatched += 1
-    return unmatched, crossings
+        heard = bag.heard
+        columns = heard.slot.tolist(), heard.sender.tolist(), heard.time_ns.tolist(), heard.data
+        for slot, sender, arrival_ns, data in zip(*columns, strict=True):
+            origin = sent.get((slot, sender))
+            if origin is None or origin.data != data:
+                origin = earlier.get((slot, sender), origin)
+            if origin is not None and origin.data == data:
+                count += 1
+                if origin.process[1] >= 0 and receiver[1] >= 0:
+                    rows.append((numbers[origin.process], numbers[receiver], origin.sent_ns, arrival_ns))
+            elif origin is not None or (complete and sender in whole):
+                unmatched += 1
+    return count, unmatched, Crossings(*np.array(rows, np.int64).reshape(-1, 4).T)
 
 
 class _SlotStarts:
     """When slots started on the common time line."""
 
-    def __init__(self, processes: Mapping[Process, AgentBag], line: TimeLine, slot_ns: int) -> None:
-        self._started = [line.clocks[process].common_ns(bag.started_ns) for process, bag in processes.items()
-                         if process in line.clocks and process[1] == 0]  # fmt: skip
-        starts: dict[int, list[int]] = {}
-        for process, bag in processes.items():
-            if process in line.clocks:
-                for record in bag.slots:
-                    starts.setdefault(record.slot, []).append(line.clocks[process].common_ns(record.start_ns))
-        count = max((len(at) for at in starts.values()), default=0)  # the most that were ever there together
-        spread = {slot: max(at) - min(at) for slot, at in sorted(starts.items())}
+    def __init__(self, processes: Processes, clocks: Mapping[Process, Clock], slot_ns: int) -> None:
+        self._slot_ns = slot_ns
+        on_line = [(process, clocks[process], bag) for process, bag in processes.items() if process in clocks]
+        starts = [(bag.slots, clock.common_ns(bag.start_ns)) for _, clock, bag in on_line]
+        first = [int(clock.common_ns(bag.started_ns)) for process, clock, bag in on_line if process[1] == 0]
+        self._started_ns = max(first, default=None)
+        self._slot = np.unique(np.concatenate([np.zeros(0, np.int64), *(slots for slots, _ in starts)]))
+        self._zero_ns = min((int(at_ns.min()) for _, at_ns in starts if len(at_ns)), default=0)
+        # (slots, processes) from `_zero_ns` on; not a number: the process had no such slot
+        at = self._at_ns = np.full((len(self._slot), len(starts)), np.nan)
+        for column, (slots, at_ns) in enumerate(starts):
+            at[np.searchsorted(self._slot, slots), column] = at_ns - self._zero_ns
+        count = np.isfinite(at).sum(axis=1)
+        self._spread_ns = np.nanmax(at, axis=1, initial=-np.inf) - np.nanmin(at, axis=1, initial=np.inf)
+        alike = (count == count.max(initial=0)) & (self._spread_ns < slot_ns // 2)
         #: First slot in which as many as ever are there and count alike.
-        self.common_slot: int | None = next(
-            (slot for slot, apart in spread.items() if len(starts[slot]) == count and apart < slot_ns // 2), None
-        )
-        self._common_ns = min(starts[self.common_slot]) if self.common_slot is not None else None
-        after = [slot for slot in spread if self.common_slot is not None and slot >= self.common_slot]
-        self._spread = [spread[slot] for slot in after if len(starts[slot]) > 1]
-        self._torn = sum(apart >= slot_ns // 2 for apart in self._spread)
+        self.common_slot = int(self._slot[np.argmax(alike)]) if alike.any() else None
+        self._shared = (count > 1) & alike.any() & (self._slot >= (self.common_slot or 0))
 
     def summary(self) -> dict[str, Any]:
         """When all counted alike, and how far apart slots started then."""
-        known = self._common_ns is not None and self._started
-        after = (self._common_ns - max(self._started)) / 1e9 if known else None
+        spread, after_s = self._spread_ns[self._shared], None
+        if self.common_slot is not None and self._started_ns is not None:
+            common = self._at_ns[np.searchsorted(self._slot, self.common_slot)]
+            after_s = (int(np.nanmin(common)) + self._zero_ns - self._started_ns) / 1e9
         return {
             "common_slot": self.common_slot,
-            "common_after_last_start_s": after,
-            "slots_apart": self._torn,  # later ones that began half a slot apart or more
+            "common_after_last_start_s": after_s,
+            "slots_apart": int((spread >= self._slot_ns // 2).sum()),  # later ones that began half a slot apart or more
             "clock_spread_ms": {
-                "mean": float(np.mean(self._spread)) / 1e6 if self._spread else None,
-                "max": max(self._spread) / 1e6 if self._spread else None,
-                "end": max(self._spread[-_END:]) / 1e6 if self._spread else None,
+                "mean": float(spread.mean()) / 1e6 if len(spread) else None,
+                "max": float(spread.max()) / 1e6 if len(spread) else None,
+                "end": float(spread[-_END:].max()) / 1e6 if len(spread) else None,
             },
         }
 
-
-def _line_of_slots(
-    processes: Mapping[Process, AgentBag], clocks: Mapping[Process, Clock], first: int, slot_ns: int
-) -> tuple[float, float]:
-    """Start of slot 0 and length of a slot, ns of common time, as a straight line through the slots' starts."""
-    starts: dict[int, list[int]] = {}
-    for process, bag in processes.items():
-        for record in bag.slots:
-            if record.slot >= first:
-                starts.setdefault(record.slot, []).append(clocks[process].common_ns(record.start_ns))
-    slots = np.array(sorted(starts), dtype=np.float64)
-    at = np.array([float(np.median(starts[int(slot)])) for slot in slots])
-    length = float(slot_ns)
-    if len(slots) > 1:
-        length = float(np.polyfit(slots - first, at - at[0], 1)[0])
-    return float(np.median(at - length * slots)), length
+    def line(self) -> tuple[float, float]:
+        """Start of slot 0 and length of a slot, ns of common time, as a straight line through the slots' starts."""
+        later = self._slot >= (self.common_slot or 0)
+        slots, at = self._slot[later].astype(np.float64), np.nanmedian(self._at_ns[later], axis=1) + self._zero_ns
+        length = float(self._slot_ns)
+        if len(slots) > 1:
+            length = float(np.polyfit(slots - slots[0], at - at[0], 1)[0])
+        return float(np.median(at - length * slots)), length
 
 
-def _air(
-    sent: Mapping[tuple[int, int], SentDatagram], line: TimeLine, air_ns: int, common_slot: int | None
-) -> dict[str, Any]:
-    """Two senders in a slot, and frames that were on the air together."""
-    double = [slot for slot, count in Counter(slot for slot, _ in sent).items() if count > 1]
-    after = sum(common_slot is not None and slot >= common_slot for slot in double)
-    at = sorted(line.clocks[s.process].common_ns(s.record.sent_ns) for s in sent.values() if s.process in line.clocks)
+# -- one log ---------------------------------------------------------------------------------------------------------
+def _log_alone(process: Process, bag: AgentBag) -> FlightLog:
+    """The log of a process that shares no time line with others."""
+    nothing: dict[str, Any] = {"missing": [], "broken_off": [], "nothing_written": [], "not_on_the_time_line": []}
+    return _join({process: bag}, {process: np.copy}, bag.log.first_slot, 0, nothing)
+
+
+def _join(
+    processes: Processes, times: Mapping[Process, ToCommon], common_slot: int, flight_ns: int,
+    about: Mapping[str, Any],
+) -> FlightLog:  # fmt: skip
+    """The log of a flight of which these are the agents' records.
+
+    :param common_slot: the first slot that all counted alike, slot 0 of the log.
+    :param flight_ns: from the order to send a frame to its arrival.
+    :param about: what to know of the bags, as plain values.
+    :raises BagError: if most slots are missing.
+    """
+    config = next(iter(processes.values())).swarm
+    first = min(bag.log.first_slot for bag in processes.values())
+    last = max(bag.log.first_slot + len(bag.log) for bag in processes.values()) - 1
+    if last - first >= 2 * len(np.unique(np.concatenate([bag.slots for bag in processes.values()]))) + 1000:
+        raise BagError(f"no agent tells of most of the slots {first} to {last}: no flight to record")
+    arrays = empty_arrays(last - first + 1, config.agents, config.steps, config.slot_ns)
+    arrays["start_ns"] += first * config.slot_ns
+    arrays["recorded"][:] = True
+    frames: dict[tuple[int, int], tuple[int, bytes]] = {}  # by row and sender: when, and what
+    heard: list[ReceivedFrames] = []
+    for process, bag in sorted(processes.items()):
+        log, sent, received = bag.log, bag.log.sent_frames, bag.heard
+        own, column, offset = np.flatnonzero(log.known), process[0] - 1, log.first_slot - first
+        start_ns, sent_ns = times[process](log.start_ns), np.maximum(0, times[process](bag.sent_ns))
+        start_ns[sent.row] = sent_ns
+        arrays["known"][own + offset, column] = True
+        arrays["offset_ns"][own + offset, column] = start_ns[own] - arrays["start_ns"][own + offset]
+        for name in (*DECIDED, *VECTORS, "presence", "track"):
+            arrays[name][own + offset, ..., column] = getattr(log, name)[own, ..., 0]
+        for row, at_ns, data in zip((sent.row + offset).tolist(), sent_ns.tolist(), sent.data, strict=True):
+            frames[row, column + 1] = at_ns, frame_in(data, config)
+        heard.append(ReceivedFrames(
+            received.row + offset, received.sender, received.slot, times[process](received.time_ns),
+            np.repeat(np.arange(config.agents)[None] == column, len(received.row), axis=0), received.before,
+            [frame_in(data, config) for data in received.data],
+        ))  # fmt: skip
+    taken = _sorted_by_row(heard)
+    columns = taken.slot.tolist(), taken.sender.tolist(), taken.time_ns.tolist(), taken.data
+    for slot, sender, arrival_ns, data in zip(*columns, strict=True):  # frames of agents of which there is no record
+        if first <= slot <= last:
+            frames.setdefault((slot - first, sender), (arrival_ns - flight_ns, data))
+    keys = sorted(frames)
+    for row, sender in keys:
+        at_ns, data = frames[row, sender]
+        arrays["length"][row, sender - 1] = len(data)
+        arrays["sent_ns"][row, sender - 1] = at_ns - arrays["start_ns"][row]
+    settings = run_of(config).to_dict()
+    log = FlightLog(
+        name="", settings={name: settings[name] for name in _SECTIONS}, agents=config.agents, slot_ns=config.slot_ns,
+        first_slot=first, data=b"".join([frames[key][1] for key in keys]), heard=taken, has_end=False,
+        received=np.zeros((len(keys), config.agents), np.bool_),
+        merged={**about, "common_slot": common_slot, "processes": [_describe(*one) for one in processes.items()]},
+        **arrays,
+    )  # fmt: skip
+    log.received, log.lost, log.outcome = receptions_of(log)
+    return split_log(log, common_slot)
+
+
+def _sorted_by_row(heard: Sequence[ReceivedFrames]) -> ReceivedFrames:
+    order = np.argsort(np.concatenate([one.row for one in heard]), kind="stable")
+    data = [frame for one in heard for frame in one.data]
+    arrays = (np.concatenate(columns)[order] for columns in list(zip(*heard, strict=True))[:-1])
+    return ReceivedFrames(*arrays, [data[k] for k in order.tolist()])
+
+
+def _describe(process: Process, bag: AgentBag) -> dict[str, Any]:
+    """State of a process that records of slots do not carry."""
     return {
-        "frames_sent": len(sent),
-        "slots_with_two_senders": after,
-        "slots_with_two_senders_before": len(double) - after,
-        "overlapping_frames": sum(b - a < air_ns for a, b in pairwise(at)) if air_ns else None,
+        "agent": process[0],
+        "process": process_name(process),
+        "bag": str(bag.path),
+        "first": bag.log.first_slot,
+        "last": bag.log.first_slot + len(bag.log) - 1,
+        "goals_told": bag.goals_told,
+        "ended_in_order": bool(bag.summary),
+        "broken_off": bag.broken_off,
     }
+
+
+def receptions_of(log: FlightArrays) -> tuple[NDArray[np.bool_], NDArray[np.uint16], NDArray[np.uint8]]:
+    """Received, lost and outcome, as in a log: what follows from what the agents heard.
+
+    Receivers of which there is no record are neither reached nor lost.
+    """
+    row, column = np.nonzero(log.length)
+    frame = np.arange(len(row))
+    received = np.zeros((len(row), log.agents), np.bool_)
+    if log.heard is not None:
+        place = np.full((len(log), log.agents), -1)
+        place[row, column] = frame
+        at = log.heard.slot - log.first_slot
+        inside = np.flatnonzero((at >= 0) & (at < len(log)) & (log.heard.sender > 0) & (log.heard.sender <= log.agents))
+        heard = place[at[inside], log.heard.sender[inside] - 1]
+        np.logical_or.at(received, heard[heard >= 0], log.heard.receivers[inside[heard >= 0]])
+    received[frame, column] = False
+    missed = log.known[row] & ~received
+    missed[frame, column] = False
+    lost = np.zeros(log.length.shape, np.uint16)
+    lost[row, column] = missed.sum(axis=1)
+    count = log.sent.sum(axis=1)
+    outcome = np.where(count > 1, COLLISION, np.where(count > 0, SUCCESS, IDLE)).astype(np.uint8)
+    outcome[(count == 0) & ~log.known.all(axis=1)] = UNKNOWN
+    return received, lost, outcome

@@ -9,15 +9,15 @@ way only an offset cannot be told from time under way: the line then has the clo
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Process = tuple[int, int]  # an agent's id, and which of its processes: 0, 1, ...
+Times = NDArray[np.int64]
 
 _MOST_FRAMES = 40_000  # in the fit
 _ROUNDS = 6
@@ -26,14 +26,13 @@ _LEAST_NS = 20_000.0  # a frame that is off by less is never left out
 _PPM = 1e6
 
 
-@dataclass(frozen=True, slots=True)
-class Crossing:
-    """A frame that one agent has sent and another one heard; times of their own clocks, ns."""
+class Crossings(NamedTuple):
+    """Frames that one process has sent and another one heard; times of their own clocks, ns."""
 
-    sender: Process
-    receiver: Process
-    sent_ns: int
-    arrival_ns: int
+    sender: NDArray[np.int64]  # (F,) numbers of processes
+    receiver: NDArray[np.int64]
+    sent_ns: Times
+    arrival_ns: Times
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +43,10 @@ class Clock:
     offset_ns: float
     drift: float
 
-    def common_ns(self, local_ns: int) -> int:
-        """The common time at which it shows a time, ns."""
-        since = local_ns - self.coarse_ns
-        return since - round(self.offset_ns + self.drift * since)
+    def common_ns(self, local_ns: Any) -> Any:
+        """The common times, int64, at which it shows times, ns."""
+        since = local_ns - np.int64(self.coarse_ns)
+        return since - np.rint(self.offset_ns + self.drift * since).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,21 +86,32 @@ def process_name(process: Process) -> str:
     return f"cf{process[0]}" + (f" ({process[1] + 1})" if process[1] else "")
 
 
-def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
-    """The time line of the largest group of processes whose frames go both ways, directly or by way of others."""
-    groups = both_ways(crossings)
-    rows = _used(crossings, set(groups[0])) if groups else []
-    coarse = _coarse(rows, flight_ns)
-    if not coarse:
-        return TimeLine({}, np.zeros(0), 0, float(flight_ns), groups)
-    ids = sorted(coarse)
-    column = {process: k for k, process in enumerate(ids)}
-    sender = np.array([column[c.sender] for c in rows])
-    receiver = np.array([column[c.receiver] for c in rows])
-    sent = np.array([c.sent_ns - coarse[c.sender] for c in rows], dtype=np.float64)
-    arrival = np.array([c.arrival_ns - coarse[c.receiver] for c in rows], dtype=np.float64)
-    matrix, late = _equations(sender, receiver, sent, arrival, len(ids)), arrival - sent - flight_ns
-    good, solution = np.ones(len(rows), dtype=np.bool_), np.zeros(matrix.shape[1])
+def fit(processes: Sequence[Process], crossings: Crossings, flight_ns: int) -> TimeLine:
+    """The time line of the largest group of processes whose frames go both ways, directly or by way of others.
+
+    :param processes: those that crossings have numbers of, ascending.
+    :param flight_ns: from the order to send a frame to its arrival, as supposed.
+    """
+    groups = both_ways(len(processes), crossings)
+    named = [tuple(processes[one] for one in group) for group in groups]
+    if not groups or len(groups[0]) < 2:
+        return TimeLine({}, np.zeros(0), 0, float(flight_ns), named)
+    sender, receiver, sent_ns, arrival_ns = _frames_of_fit(crossings, groups[0])
+    coarse = _coarse(sender, receiver, sent_ns, arrival_ns, flight_ns)
+    column = {process: k for k, process in enumerate(groups[0])}
+    zero_ns, place = np.zeros((2, len(processes)), np.int64)
+    for process, k in column.items():
+        zero_ns[process], place[process] = coarse[process], k
+    sent, arrival = sent_ns - zero_ns[sender], arrival_ns - zero_ns[receiver]
+    late, row = (arrival - sent - flight_ns).astype(np.float64), np.arange(len(sent))
+    matrix = np.zeros((len(sent), 2 * len(column) + 1))  # offset and drift (ns/s) of each, and the time under way
+    matrix[row, 2 * place[receiver]] = 1.0
+    matrix[row, 2 * place[receiver] + 1] = arrival / 1e9
+    matrix[row, 2 * place[sender]] -= 1.0
+    matrix[row, 2 * place[sender] + 1] -= sent / 1e9
+    matrix[:, -1] = 1.0
+    matrix = matrix[:, 2:]  # the first clock is the common one
+    good, solution = np.ones(len(sent), dtype=np.bool_), np.zeros(matrix.shape[1])
     for _ in range(_ROUNDS):
         solution = np.linalg.lstsq(matrix[good], late[good], rcond=None)[0]
         residual = late - matrix @ solution
@@ -110,71 +120,55 @@ def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
         if (kept == good).all() or not kept.any():
             break
         good = kept
-    solution = np.concatenate(([0.0, 0.0], solution))
-    clocks = {
-        process: Clock(coarse[process], float(solution[2 * k]), float(solution[2 * k + 1]) / 1e9)
-        for process, k in column.items()
-    }
-    residual = (late - matrix @ solution[2:])[good]
-    return TimeLine(clocks, residual, int((~good).sum()), flight_ns + float(solution[-1]), groups)
+    residual = (late - matrix @ solution)[good]
+    offsets = np.concatenate(([0.0, 0.0], solution[:-1])).reshape(-1, 2).tolist()
+    clocks = {processes[one]: Clock(coarse[one], offsets[k][0], offsets[k][1] / 1e9) for one, k in column.items()}
+    return TimeLine(clocks, residual, int((~good).sum()), flight_ns + float(solution[-1]), named)
 
 
-def both_ways(crossings: Sequence[Crossing]) -> list[tuple[Process, ...]]:
-    """Groups of processes between any two of which frames go both ways, directly or by way of others."""
-    pairs = {(c.sender, c.receiver) for c in crossings}
-    processes = sorted({process for pair in pairs for process in pair})
-    column = {process: k for k, process in enumerate(processes)}
-    reaches = np.eye(len(processes), dtype=np.float32)
-    for sender, receiver in pairs:
-        reaches[column[sender], column[receiver]] = 1.0
-    for _ in range(len(processes).bit_length()):  # each round doubles the frames that a way may have
-        reaches = (reaches @ reaches > 0).astype(np.float32)
-    mutual = (reaches > 0) & (reaches.T > 0)
-    groups = {tuple(processes[k] for k in np.flatnonzero(row)) for row in mutual}
+def both_ways(count: int, crossings: Crossings) -> list[tuple[int, ...]]:
+    """Groups of processes between any two of which frames go both ways, directly or by way of others; largest first.
+
+    :param count: of all processes.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.ones(len(crossings.sender), np.bool_), (crossings.sender, crossings.receiver)
+    _, label = connected_components(coo_matrix(edges, (count, count)), connection="strong")
+    sharing = np.union1d(crossings.sender, crossings.receiver)
+    groups = [tuple(sharing[label[sharing] == one].tolist()) for one in np.unique(label[sharing])]
     return sorted(groups, key=lambda group: (-len(group), group))
 
 
-def _used(crossings: Sequence[Crossing], group: set[Process]) -> list[Crossing]:
-    """The frames of the fit: those within a group, and of many every k-th of each pair, so that both ways stay."""
-    within = [c for c in crossings if c.sender in group and c.receiver in group]
-    every, seen, used = max(1, len(within) // _MOST_FRAMES), Counter[tuple[Process, Process]](), []
-    for c in within:
-        if seen[c.sender, c.receiver] % every == 0:
-            used.append(c)
-        seen[c.sender, c.receiver] += 1
-    return used
+def _frames_of_fit(crossings: Crossings, group: Sequence[int]) -> Crossings:
+    """The frames within a group; of many every k-th of each pair, so that both ways stay."""
+    within = np.isin(crossings.sender, group) & np.isin(crossings.receiver, group)
+    frames = Crossings(*(values[within] for values in crossings))
+    pair = frames.sender * (max(group) + 1) + frames.receiver
+    order = np.argsort(pair, kind="stable")
+    number = np.empty(len(pair), np.int64)  # of each among the frames of its pair
+    number[order] = np.arange(len(pair)) - np.searchsorted(pair[order], pair[order])
+    used = number % max(1, len(pair) // _MOST_FRAMES) == 0
+    return Crossings(*(values[used] for values in frames))
 
 
-def _equations(
-    sender: NDArray[np.intp], receiver: NDArray[np.intp], sent: Any, arrival: Any, agents: int
-) -> NDArray[np.float64]:
-    """A row a frame: offset and drift (ns/s) of each agent but the first, and the time under way."""
-    matrix = np.zeros((len(sender), 2 * agents + 1))
-    row = np.arange(len(sender))
-    matrix[row, 2 * receiver] = 1.0
-    matrix[row, 2 * receiver + 1] = arrival / 1e9
-    matrix[row, 2 * sender] -= 1.0
-    matrix[row, 2 * sender + 1] -= sent / 1e9
-    matrix[:, -1] = 1.0
-    return matrix[:, 2:]
-
-
-def _coarse(crossings: Sequence[Crossing], flight_ns: int) -> dict[Process, int]:
-    """What each clock shows at about the same time, from frame to frame; empty without frames."""
-    pairs: dict[tuple[Process, Process], list[int]] = {}
-    for c in crossings:
-        pairs.setdefault((c.sender, c.receiver), []).append(c.arrival_ns - c.sent_ns - flight_ns)
-    if not pairs:
-        return {}
-    ahead = {pair: sorted(values)[len(values) // 2] for pair, values in pairs.items()}
-    first = min(min(pair) for pair in pairs)
-    start = min(c.sent_ns if c.sender == first else c.arrival_ns for c in crossings if first in (c.sender, c.receiver))
-    found, waiting = {first: start}, [first]
+def _coarse(
+    sender: NDArray[np.int64], receiver: NDArray[np.int64], sent_ns: Times, arrival_ns: Times, flight_ns: int
+) -> dict[int, int]:
+    """What each clock shows at about the same time, from frame to frame."""
+    lead = arrival_ns - sent_ns - flight_ns
+    ahead = []  # by how much a clock is ahead of another, by the median frame
+    for one, other in dict.fromkeys(zip(sender.tolist(), receiver.tolist(), strict=True)):
+        values = np.sort(lead[(sender == one) & (receiver == other)])
+        median = int(values[len(values) // 2])
+        ahead += [(one, other, median), (other, one, -median)]
+    first = int(min(sender.min(), receiver.min()))
+    shown, waiting = {first: int(min([*sent_ns[sender == first], *arrival_ns[receiver == first]]))}, [first]
     while waiting:
         process = waiting.pop()
-        for (sender, receiver), by in ahead.items():
-            for known, new, sign in ((sender, receiver, 1), (receiver, sender, -1)):
-                if known == process and new not in found:
-                    found[new] = found[process] + sign * by
-                    waiting.append(new)
-    return found
+        for known, new, by in ahead:
+            if known == process and new not in shown:
+                shown[new] = shown[process] + by
+                waiting.append(new)
+    return shown

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.log.agent_bag import find_bags, read_all
 from dtsa_bench.log.arrays import recorded_config
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.writer import BROKEN_OFF
-from dtsa_bench.log.agent_bag import find_bags, read_all
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merged_flight import check_rules
 from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, build_log, check_format
@@ -21,9 +21,7 @@ from dtsa_bench.runs.config import LOCKSTEP, REALTIME
 from dtsa_bench.runs.delivery import recorded_problem
 
 from .contents import EVENTS, MERGED, BagContents
-from .lockstep import check_lockstep
-from .merged import check_merged
-from .realtime import check_realtime
+from .flights import check_lockstep, check_merged, check_realtime
 from .result import Difference, Mismatch, Result
 
 
@@ -80,12 +78,12 @@ def _verify_agents(paths: Sequence[Path], result: Result) -> None:
 
 def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) -> None:
     mode = result.mode
-    # Missions say what they fly with instead of a mode of runs.
-    settings = bag.config if mode in (LOCKSTEP, MERGED) else {**bag.config, "mode": REALTIME}
-    contents = BagContents(bag, recorded_config(settings).swarm.slot_ns, result)
     if mode == AGENT:
         _verify_agents([bag.path], result)
         return
+    # Missions say what they fly with instead of a mode of runs.
+    settings = bag.config if mode in (LOCKSTEP, MERGED) else {**bag.config, "mode": REALTIME}
+    contents = BagContents(bag, recorded_config(settings).swarm.slot_ns, result)
     log = build_log(bag, contents.records)
     if mode == MERGED:
         check_merged(log, result)

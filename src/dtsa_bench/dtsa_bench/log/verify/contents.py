@@ -14,7 +14,7 @@ from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import RUN_ID
 from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest
-from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER
+from dtsa_bench.log.record import SLOT_RECORD, SNIFFER
 
 from .result import Mismatch, Result
 
@@ -65,8 +65,8 @@ class BagContents:
 
     def _add_record(self, message: BagMessage) -> None:
         record, mode = self._bag.decode(message), self._result.mode
-        slot, stamp, is_partial = int(record.slot), record.header.stamp, mode in (AGENT, SNIFFER)
-        right = message.log_time_ns if is_partial else names.slot_time_ns(slot, self._slot_ns)
+        slot, stamp = int(record.slot), record.header.stamp
+        right = message.log_time_ns if mode == SNIFFER else names.slot_time_ns(slot, self._slot_ns)
         for what, expected, recorded in (
             ("log time", right, message.log_time_ns),
             ("publish time", right, message.publish_time_ns),
@@ -78,7 +78,7 @@ class BagContents:
                 why = "slots start one slot length after the other" if what != "run" else "the run's id"
                 raise Mismatch(f"slot record, {what}", expected, recorded, why, slot)
         following = int(self.records[-1].slot) + 1 if self.records else slot if mode == MERGED else 0
-        if slot != following and not is_partial:
+        if slot != following and mode != SNIFFER:
             if self._result.broken_off and slot > following:  # in real time records are written after other messages
                 self._whole_ns = message.log_time_ns - 1
                 return

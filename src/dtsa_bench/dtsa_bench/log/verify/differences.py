@@ -54,23 +54,23 @@ def first_difference(log: FlightArrays, expected: Mapping[str, NDArray[Any]], wh
             what = f"received, frame of cf{sender}"
         if name == "chosen":
             reason += f"; reason: {_reason_text(int(log.reason[place]))}"
-        values = [_shown(name, values[place].item(), log) for values in (right, recorded)]
+        expected_text, recorded_text = (_shown(name, values[place].item(), log) for values in (right, recorded))
         agent = place[-1] + 1 if len(place) > 1 else None
-        differences.append((row, Mismatch(what, *values, reason, row, agent)))
+        differences.append((row, Mismatch(what, expected_text, recorded_text, reason, row, agent)))
     return min(differences, key=lambda entry: entry[0])[1] if differences else None
 
 
 def decision_difference(found: DecisionDifference, log: FlightArrays, why: str) -> Mismatch:
     """A decision of a replayed agent that is not as recorded."""
-    values = [_shown(found.field, value, log) for value in (found.expected, found.recorded)]
-    return Mismatch(found.field, *values, why, found.slot, found.agent)
+    expected, recorded = (_shown(found.field, value, log) for value in (found.expected, found.recorded))
+    return Mismatch(found.field, expected, recorded, why, found.slot, found.agent)
 
 
 def frame_difference(expected: dict[int, bytes], recorded: dict[int, bytes], row: int, log: FlightArrays) -> Mismatch:
     """The first frame of a slot that is not as expected; frames by the sender's id."""
     sender = next(agent for agent in sorted({*expected, *recorded}) if expected.get(agent) != recorded.get(agent))
-    values = [_shown("frame", frames.get(sender, b""), log) for frames in (expected, recorded)]
-    return Mismatch("frame", *values, WHY["frame"], row, sender)
+    right, other = (_shown("frame", frames.get(sender, b""), log) for frames in (expected, recorded))
+    return Mismatch("frame", right, other, WHY["frame"], row, sender)
 
 
 def _shown(name: str, value: Any, log: FlightArrays) -> str:

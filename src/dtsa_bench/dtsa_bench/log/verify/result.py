@@ -21,10 +21,8 @@ class Difference:
     agent: int | None = None  # id
 
     def __str__(self) -> str:
-        places = [
-            f"{name} {place}" for name, place in (("slot", self.slot), ("agent", self.agent)) if place is not None
-        ]
-        where = f"{', '.join(places)}: " if places else ""
+        known = {name: place for name, place in (("slot", self.slot), ("agent", self.agent)) if place is not None}
+        where = f"{', '.join(f'{name} {place}' for name, place in known.items())}: " if known else ""
         return f"{where}{self.what}: expected {self.expected}, recorded {self.recorded} ({self.reason})"
 
 
@@ -32,14 +30,9 @@ class Mismatch(Exception):
     """Carries the first difference out of nested checks; arguments are those of :class:`Difference`."""
 
     def __init__(
-        self,
-        what: str,
-        expected: object,
-        recorded: object,
-        reason: str,
-        slot: int | None = None,
+        self, what: str, expected: object, recorded: object, reason: str, slot: int | None = None,
         agent: int | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.difference = Difference(what, str(expected), str(recorded), reason, slot, agent)
         super().__init__(str(self.difference))
 

@@ -186,29 +186,26 @@ def fly_all(steps: Sequence[Sequence[DemoFlight]], directory: Path, stop: Stop) 
     """
     demo = [flight for step in steps for flight in step]
     lockstep = [flight for flight in demo if not flight.live]
-    line, failed, flown = ProgressLine("flights in lockstep"), threading.Event(), 0
+    line, failed = ProgressLine("flights in lockstep"), threading.Event()
     over = StopOr(stop, failed.is_set)
 
     def fly_demo_flight(flight: DemoFlight) -> Flight | None:
-        nonlocal flown
-        if over:
-            return None
         quiet = ProgressLine(flight.key, io.StringIO())  # several flights at once have one line for all
         try:
             options = FlightOptions(processes=1, pictures=False)
-            result = fly(flight.run, directory / flight.key, options, over, progress=quiet)
+            return None if over else fly(flight.run, directory / flight.key, options, over, progress=quiet)
         except BaseException:
             failed.set()
             raise
-        flown += 1
-        line.show(f"{flown} of {len(lockstep)} flown")
-        return result
 
+    finished: dict[str, FinishedFlight] = {}
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        futures = [pool.submit(fly_demo_flight, flight) for flight in lockstep]
+        flown = zip(lockstep, pool.map(fly_demo_flight, lockstep), strict=True)
+        for number, (flight, result) in enumerate(flown, 1):
+            line.show(f"{number} of {len(lockstep)} flown")
+            if result is not None:
+                finished[flight.key] = read_flight(flight, result)
     line.end()
-    results = zip(lockstep, [future.result() for future in futures], strict=True)
-    finished = {flight.key: read_flight(flight, result) for flight, result in results if result is not None}
     for flight in demo:
         if flight.live and not stop:
             finished[flight.key] = _fly_live(flight, directory / flight.key, stop)

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 from PIL import Image
 
 from dtsa_bench.drawing.flight_paths import frame_bare, paint
@@ -28,7 +27,6 @@ HOVER = "#c3ccd6"  # of cells: an agent that hovers has nothing new to say
 FIRST, COUNT = 100, 40  # the slots that are shown, well under way
 ROUNDS = 16  # columns of each part around a death or a return
 FRAME_MS, LAST_FRAME_MS = 90, 3500  # of the animation
-_RGB = np.array([1 << 16, 1 << 8, 1])  # a colour as one number
 WIDTH, LEFT, RIGHT = 8.6, 0.4, 0.4  # inches, of the picture and its margins
 TITLE = "One radio channel, twelve quadcopters: who speaks next?"
 INTRO = (
@@ -319,19 +317,7 @@ def draw_animation(path: Path, flights: Flights, slots: int = 80) -> None:
             canvas.draw()
             pictures.append(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
     durations = [FRAME_MS] * (slots - 1) + [LAST_FRAME_MS]
-    first, *rest = _share_palette(pictures)
+    # In the colours of the last: what does not move does not change, and files stay small.
+    shades = Image.fromarray(pictures[-1]).quantize(255, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    first, *rest = (Image.fromarray(one).quantize(palette=shades, dither=Image.Dither.NONE) for one in pictures)
     first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
-
-
-def _share_palette(pictures: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:
-    """Pictures, (H, W, 3) each, in the 255 most frequent colours of the last: what does not move does not change."""
-    colours, counts = np.unique(pictures[-1] @ _RGB, return_counts=True)
-    palette = colours[np.argsort(-counts, kind="stable")[:255]][:, None] // _RGB % 256
-    frames = []
-    for picture in pictures:
-        shades, index = np.unique(picture @ _RGB, return_inverse=True)
-        nearest = ((shades[:, None, None] // _RGB % 256 - palette) ** 2).sum(axis=2).argmin(axis=1).astype(np.uint8)
-        frame = Image.fromarray(nearest[index.reshape(picture.shape[:2])])
-        frame.putpalette(palette.astype(np.uint8).tobytes())
-        frames.append(frame)
-    return frames

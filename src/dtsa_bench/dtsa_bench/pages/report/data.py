@@ -5,18 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import REASONS, Scenario
+from dtsa_agent.core import REASONS
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
+from dtsa_bench.log.knowledge import MeanAges
 from dtsa_bench.log.merged_bag import open_log
-from dtsa_bench.log.replay import MeanAges
 from dtsa_bench.pages.html import BINS, PALETTE, SCRIPTS, flatten, pack, reduce_bins, render_page, thin, write_page
 from dtsa_bench.runs.delivery import as_sentence, recorded_problem
 from dtsa_channel_sim.model.verdict import OUTCOMES
@@ -40,15 +40,17 @@ def run_data(path: str | Path) -> dict[str, Any]:
     """
     run = open_log(path)
     distances = pair_distances(run, collision_m(run))
-    followed, scenario = run.knowledge, run.scenario
-    ages = followed.ages
+    followed, reasons = run.knowledge, _reasons(run)
     notes = [*run.notes, *followed.notes]
-    told = as_sentence(recorded_problem(run.file or path))
-    if told and not any(note.startswith(told.partition(":")[0]) for note in notes):
-        notes.append(told)
-    if unknown := int((run.recorded & ~run.outcome_known).sum()):
-        notes.append(f"Of {unknown} slots it is not known whether an agent sent: not all agents have reported them.")
-    summary = followed.summary | _counts(run)
+    recorded = as_sentence(recorded_problem(run.file or path))
+    if recorded and not any(note.startswith(recorded.partition(":")[0]) for note in notes):
+        notes.append(recorded)
+    unknown = np.flatnonzero(run.recorded & ~run.outcome_known).tolist()
+    if unknown:
+        notes.append(
+            f"Of {len(unknown)} slots it is not known whether an agent sent: not all agents have reported them."
+        )
+    summary = followed.summary | _counts(run, len(unknown))
     if distances is not None and summary.get("min_distance_m") is None and len(distances.least):
         summary["min_distance_m"] = float(np.nanmin(distances.least))
     return {
@@ -59,30 +61,39 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "config": flatten(run.settings),
         "agents": run.agents,
         "crashes": list_crashes(distances, run, summary),
-        "moving": scenario.moving.tolist() if scenario else [True] * run.agents,
+        "moving": run.moving.tolist(),
         "slot_s": run.slot_ns / 1e9,
-        "duration_s": _duration_s(run),
+        "duration_s": len(run) * run.slot_ns / 1e9,
         "summary": summary,
-        "scene": _scene(run, scenario),
-        "slots": _slots(run),
+        "scene": _scene(run),
+        "slots": _slots(run, reasons, unknown),
         "channel": _channel_use(run),
-        "decisions": _reasons(run),
-        "sent_for": _reasons_sent(run),
+        "decisions": _decisions(run, reasons),
+        "sent_for": [reasons.names[code] for code in np.unique(reasons.sent_for).tolist() if code < len(reasons.names)],
         "distances": distance_chart(distances, run),
-        "ages": _ages(ages, run),
-        "table": _table(run, ages, scenario),
+        "ages": _ages(followed.ages, run),
+        "table": [_agent_row(run, followed.ages, agent) for agent in range(1, run.agents + 1)],
     }
 
 
-def _duration_s(run: FlightLog) -> float:
-    return len(run) * run.slot_ns / 1e9
+class _Reasons(NamedTuple):
+    """Why agents decided as they did."""
+
+    codes: NDArray[np.uint8]  # reasons that decisions had, ascending
+    names: list[str]  # of these
+    sent_for: NDArray[np.int64]  # why each frame was sent, as its sender decided: place in codes; 255: not recorded
 
 
-def _counts(run: FlightLog) -> dict[str, Any]:
+def _reasons(run: FlightLog) -> _Reasons:
+    codes, frames = np.unique(run.reason[run.known]), run.sent_frames
+    sender = frames.row, frames.sender - 1
+    sent_for = np.where(run.known[sender], np.searchsorted(codes, run.reason[sender]), 255)
+    return _Reasons(codes, [REASONS[code] if code < len(REASONS) else str(code) for code in codes.tolist()], sent_for)
+
+
+def _counts(run: FlightLog, unknown: int) -> dict[str, Any]:
     counts = np.bincount(run.outcome[run.outcome_known], minlength=len(OUTCOMES))
-    unknown = int((run.recorded & ~run.outcome_known).sum())
-    frames = run.sent_frames
-    offered = int(run.known_receivers.sum())
+    frames, offered = run.sent_frames, int(run.known_receivers.sum())
     return {
         "slots": {
             "total": int(run.recorded.sum()),
@@ -94,106 +105,75 @@ def _counts(run: FlightLog) -> dict[str, Any]:
     }
 
 
-def _scene(run: FlightLog, scenario: Scenario | None) -> dict[str, Any] | None:
+def _scene(run: FlightLog) -> dict[str, Any] | None:
     time_s, path = run.instants_s, run.path
     if not len(time_s):
         return None
     frames = int(min(float(time_s[-1] - time_s[0]) * SCENE_HZ, SCENE_VALUES / (3 * run.agents))) + 2
     index = np.unique(np.linspace(0, len(time_s) - 1, min(frames, len(time_s))).astype(int))
-    known = np.isfinite(path[index])
     place = np.nan_to_num(path[index])
-    span = max(1.0, float(np.abs(place).max()))
-    scale = span / 32000
-    targets = scenario.target if scenario else place[-1]
-    place = np.where(known, place, scale * UNKNOWN)
+    scale = max(1.0, float(np.abs(place).max())) / 32000
+    targets = run.scenario.target if run.scenario else place[-1]
+    whole = np.where(np.isfinite(path[index]), np.round(place / scale), UNKNOWN)
     return {
         "ids": list(range(1, run.agents + 1)),
         "time": pack(time_s[index].astype("<f4")),
-        "position": pack(np.round(place / scale).astype("<i2")),
+        "position": pack(whole.astype("<i2")),
         "scale": scale,
         "target": np.round(targets, 3).T.tolist(),
     }
 
 
-def _slots(run: FlightLog) -> dict[str, Any]:
+def _slots(run: FlightLog, reasons: _Reasons, unknown: list[int]) -> dict[str, Any]:
     """Every frame that was sent: in which slot, by whom, why, and what became of it."""
-    frames, unknown = run.sent_frames, np.flatnonzero(run.recorded & ~run.outcome_known)
+    frames = run.sent_frames
     share = frames.received.sum(axis=1) / np.maximum(1, run.known_receivers)
     return {
         "slot": pack(frames.row.astype("<u4")),
         "sender": pack(frames.sender.astype("<u2")),
         "outcome": pack(np.minimum(run.outcome[frames.row], len(OUTCOMES) - 1)),
-        "reason": pack(_sender_reason(run).astype(np.uint8)),
+        "reason": pack(reasons.sent_for.astype(np.uint8)),
         "received": pack(np.round(255 * np.minimum(share, 1)).astype(np.uint8)),
-        **({"unknown": unknown.tolist()} if len(unknown) else {}),
+        **({"unknown": unknown} if unknown else {}),
         "first": 0,
         "count": len(run),
     }
 
 
-def _sender_reason(run: FlightLog) -> NDArray[np.int64]:
-    """Why each frame was sent, as its sender decided, by `_reason_codes`; 255 where that was not recorded."""
-    frames, codes = run.sent_frames, _reason_codes(run)
-    place = np.searchsorted(codes, run.reason[frames.row, frames.sender - 1])
-    return np.where(run.known[frames.row, frames.sender - 1], place, 255)
-
-
-def _reason_codes(run: FlightLog) -> NDArray[np.uint8]:
-    """Reasons that decisions had."""
-    return np.unique(run.reason[run.known])
-
-
-def _reason_names(run: FlightLog) -> list[str]:
-    return [REASONS[code] if code < len(REASONS) else str(code) for code in _reason_codes(run).tolist()]
-
-
-def _reasons_sent(run: FlightLog) -> list[str]:
-    """Reasons for which something was sent."""
-    codes = np.unique(_sender_reason(run))
-    names = _reason_names(run)
-    return [names[code] for code in codes.tolist() if code < len(names)]
-
-
-def _bin_of(run: FlightLog, slots: NDArray[np.int64]) -> tuple[NDArray[np.int64], int, Array]:
-    """Bin of each slot, number of bins, and the time in the middle of each bin, s."""
-    count = max(1, min(BINS, len(run) // max(10, run.agents)))  # a few slots at least in each
-    middle = (np.arange(count) + 0.5) * len(run) / count * run.slot_ns / 1e9
-    return np.clip(slots * count // len(run), 0, count - 1), count, middle
+def _sum_in_bins(run: FlightLog, slots: NDArray[np.int64], kinds: Any, values: Any, count: int) -> tuple[Array, Array]:
+    """Sums of values over time by kind, (count, bins), and the time in the middle of each bin, s."""
+    bins = max(1, min(BINS, len(run) // max(10, run.agents)))  # a few slots at least in each
+    sums = np.zeros((count, bins))
+    np.add.at(sums, (kinds, np.clip(slots * bins // max(1, len(run)), 0, bins - 1)), values)
+    return sums, (np.arange(bins) + 0.5) * len(run) / bins * run.slot_ns / 1e9
 
 
 def _channel_use(run: FlightLog) -> dict[str, Any] | None:
-    slots = np.flatnonzero(run.recorded)
+    slots, frames = np.flatnonzero(run.recorded), run.sent_frames
     if not len(slots):
         return None
-    bins, count, middle = _bin_of(run, slots)
-    shares = np.zeros((len(OUTCOMES), count))
-    np.add.at(shares, (np.minimum(run.outcome[slots], len(OUTCOMES) - 1), bins), run.outcome_known[slots])
-    shares /= np.maximum(1, np.bincount(bins, minlength=count))
-    frames = run.sent_frames
-    lost, offered = np.zeros(count), np.zeros(count)
-    if len(frames.row):
-        place, _, _ = _bin_of(run, frames.row)
-        np.add.at(lost, place, frames.lost)
-        np.add.at(offered, place, np.maximum(run.merged is None, run.known_receivers))
+    kinds = np.minimum(run.outcome[slots], len(OUTCOMES) - 1)
+    shares, middle = _sum_in_bins(run, slots, kinds, run.outcome_known[slots], len(OUTCOMES))
+    (recorded,), _ = _sum_in_bins(run, slots, 0, 1, 1)
+    (lost,), _ = _sum_in_bins(run, frames.row, 0, frames.lost, 1)
+    (offered,), _ = _sum_in_bins(run, frames.row, 0, np.maximum(run.merged is None, run.known_receivers), 1)
     return {
         "time": thin(middle),
-        "share": {name: thin(shares[index]) for index, name in enumerate(OUTCOMES)},
+        "share": {name: thin(row / np.maximum(1, recorded)) for name, row in zip(OUTCOMES, shares, strict=True)},
         "lost": thin(lost / np.maximum(1, offered)),
     }
 
 
-def _reasons(run: FlightLog) -> dict[str, Any] | None:
+def _decisions(run: FlightLog, reasons: _Reasons) -> dict[str, Any] | None:
     slots, column = np.nonzero(run.known)
     if not len(slots):
         return None
-    bins, count, middle = _bin_of(run, slots)
-    names = _reason_names(run)
-    shares = np.zeros((len(names), count))
-    np.add.at(shares, (np.searchsorted(_reason_codes(run), run.reason[slots, column]), bins), 1)
+    kinds = np.searchsorted(reasons.codes, run.reason[slots, column])
+    shares, middle = _sum_in_bins(run, slots, kinds, 1, len(reasons.names))
     least = np.where(run.known, run.chosen, np.iinfo(np.uint16).max).min(axis=1)
     most = np.where(run.known, run.chosen, 0).max(axis=1)
     return {
-        "names": names,
+        "names": reasons.names,
         "total": shares.sum(axis=1).astype(int).tolist(),
         "time": thin(middle),
         "share": [thin(row) for row in shares / np.maximum(1, shares.sum(axis=0))],
@@ -207,9 +187,9 @@ def _ages(ages: MeanAges | None, run: FlightLog) -> dict[str, Any] | None:
 
     def chart(values: Array, digits: int) -> dict[str, Any]:
         known = np.isfinite(values)
-        counts = np.maximum(1, known.sum(axis=1))
-        mean = np.where(known.any(axis=1), np.nansum(values, axis=1) / counts, np.nan)
-        most = np.where(known.any(axis=1), np.nan_to_num(values, nan=-1).max(axis=1), np.nan)
+        some = known.any(axis=1)
+        mean = np.where(some, np.nansum(values, axis=1) / np.maximum(1, known.sum(axis=1)), np.nan)
+        most = np.where(some, np.nan_to_num(values, nan=-1).max(axis=1), np.nan)
         heat = np.stack([reduce_bins(column, np.nanmax) for column in values.T])
         top = max(1e-9, float(np.nanmax(heat)) if np.isfinite(heat).any() else 1.0)
         level = np.where(np.isfinite(heat), np.round(254 * np.nan_to_num(heat) / top), 255).astype(np.uint8)
@@ -221,42 +201,32 @@ def _ages(ages: MeanAges | None, run: FlightLog) -> dict[str, Any] | None:
         }
 
     time_s = run.time_s(run.slot + 1)
-    return {
-        "time": thin(reduce_bins(time_s, np.mean)),
-        "age": chart(ages.age, 2),
-        "error": chart(ages.error, 4),
+    return {"time": thin(reduce_bins(time_s, np.mean)), "age": chart(ages.age, 2), "error": chart(ages.error, 4)}
+
+
+def _agent_row(run: FlightLog, ages: MeanAges | None, agent: int) -> dict[str, Any]:
+    """The row of an agent in the table."""
+    frames, is_merged = run.sent_frames, run.merged is not None
+    own = frames.sender == agent
+    offered = int(run.known_receivers[own].sum())
+    heard = round(float(frames.received[own].sum()) / max(1, offered), 4)
+    row: dict[str, Any] = {
+        "id": agent,
+        "moving": bool(run.scenario.moving[agent - 1]) if run.scenario else None,
+        "sent": int(own.sum()),
+        "heard": heard if own.any() and (offered or not is_merged) else None,
+        "collided": None if is_merged else int((frames.collided[own] > 0).sum()),
     }
-
-
-def _table(run: FlightLog, ages: MeanAges | None, scenario: Scenario | None) -> list[dict[str, Any]]:
-    """One row an agent."""
-    frames, path = run.sent_frames, run.path
-    rows = []
-    for agent in range(1, run.agents + 1):
-        own = frames.sender == agent
-        offered = int(run.known_receivers[own].sum())
-        known_share = own.any() and (offered or run.merged is None)
-        row: dict[str, Any] = {
-            "id": agent,
-            "moving": bool(scenario.moving[agent - 1]) if scenario else None,
-            "sent": int(own.sum()),
-            "heard": round(float(frames.received[own].sum()) / max(1, offered), 4) if known_share else None,
-            "collided": int((frames.collided[own] > 0).sum()) if run.merged is None else None,
-        }
-        if ages is not None:
-            column = ages.results, agent - 1
-            for name, values, digits in (("age", ages.age, 2), ("error", ages.error, 4)):
-                known = values[column][np.isfinite(values[column])]
-                row[f"{name}_mean"] = round(float(known.mean()), digits) if len(known) else None
-                row[f"{name}_max"] = round(float(known.max()), digits) if len(known) else None
-        if len(path) > 1:
-            track = path[:, :, agent - 1]
-            known = np.isfinite(track).all(axis=1)
-            steps = np.diff(track[known], axis=0)
-            if known.any():
-                row["path"] = round(float(np.sqrt((steps**2).sum(axis=1)).sum()), 3)
-        rows.append(row)
-    return rows
+    for name, digits in (("age", 2), ("error", 4)) if ages else ():
+        values = getattr(ages, name)
+        known = values[np.isfinite(values[:, agent - 1]) & ages.results, agent - 1]
+        row[f"{name}_mean"] = round(float(known.mean()), digits) if len(known) else None
+        row[f"{name}_max"] = round(float(known.max()), digits) if len(known) else None
+    track = run.path[:, :, agent - 1]
+    track = track[np.isfinite(track).all(axis=1)]
+    if len(run.path) > 1 and len(track):
+        row["path"] = round(float(np.sqrt((np.diff(track, axis=0) ** 2).sum(axis=1)).sum()), 3)
+    return row
 
 
 def mission_data(path: str | Path) -> dict[str, Any] | None:

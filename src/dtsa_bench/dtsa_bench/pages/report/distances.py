@@ -34,10 +34,10 @@ class Distances:
 
 def pair_distances(run: FlightLog, collision_m: float = 0.2) -> Distances | None:
     """Distances at the recorded moments, and pairs below `collision_m`; None with fewer than two agents."""
-    count, time_s, path = run.agents, run.instants_s, run.path
-    if count < 2 or not len(time_s):
+    time_s, path = run.instants_s, run.path
+    if run.agents < 2 or not len(time_s):
         return None
-    first, second = np.triu_indices(count, 1)
+    first, second = np.triu_indices(run.agents, 1)
     least = np.empty(len(time_s))
     closest = np.full(len(first), np.inf)
     touched = np.full(len(first), -1)
@@ -50,17 +50,13 @@ def pair_distances(run: FlightLog, collision_m: float = 0.2) -> Distances | None
         near = apart < collision_m
         new = near.any(axis=0) & (touched < 0)
         touched[new] = start + near[:, new].argmax(axis=0)
-    if not np.isfinite(closest).any():
+    chosen = [k for k in np.argsort(closest, kind="stable")[:PAIRS].tolist() if math.isfinite(closest[k])]
+    if not chosen:
         return None  # no two agents of whom it is known where they were
-    chosen = [k for k in np.argsort(closest, kind="stable")[:PAIRS] if math.isfinite(closest[k])]
-    series = []
-    for k in chosen:
-        gap = path[:, :, first[k]] - path[:, :, second[k]]
-        series.append(np.sqrt((gap**2).sum(axis=1)))
-    pairs = [(int(first[k]) + 1, int(second[k]) + 1) for k in chosen]
-    crashes = [(int(first[k]) + 1, int(second[k]) + 1, int(touched[k])) for k in np.flatnonzero(touched >= 0)]
-    crashes.sort(key=lambda crash: crash[2])
-    return Distances(time_s, least, pairs, series, crashes)
+    ids = np.stack((first, second), axis=1) + 1
+    series = [np.sqrt(((path[:, :, first[k]] - path[:, :, second[k]]) ** 2).sum(axis=1)) for k in chosen]
+    crashes = [(*ids[k].tolist(), int(touched[k])) for k in np.argsort(touched, kind="stable") if touched[k] >= 0]
+    return Distances(time_s, least, [tuple(ids[k].tolist()) for k in chosen], series, crashes)
 
 
 def collision_m(run: FlightLog) -> float:
@@ -73,9 +69,8 @@ def list_crashes(distances: Distances | None, run: FlightLog, summary: Mapping[s
     """Which agents crashed, when and where; the first ones if there are many."""
     if distances is None:
         return []
-    crashes = distances.crashes
+    crashes, path = distances.crashes, run.path
     pair = tuple(summary.get("collided_pair") or ())
-    path = run.path
     if not crashes and len(pair) == 2:
         # They crashed within a slot, and only its ends were recorded.
         gap = path[:, :, pair[0] - 1] - path[:, :, pair[1] - 1]
@@ -83,14 +78,10 @@ def list_crashes(distances: Distances | None, run: FlightLog, summary: Mapping[s
     rows = []
     for first, second, moment in crashes[:MAX_CRASHES]:
         a, b = (path[moment, :, agent - 1] for agent in (first, second))
-        rows.append(
-            {
-                "ids": [first, second],
-                "time_s": round(float(distances.time_s[moment]), 3),
-                "place": thin((a + b) / 2, 3),
-                "distance_m": round(float(np.linalg.norm(a - b)), 4),
-            }
-        )
+        rows.append({
+            "ids": [first, second], "time_s": round(float(distances.time_s[moment]), 3),
+            "place": thin((a + b) / 2, 3), "distance_m": round(float(np.linalg.norm(a - b)), 4),
+        })  # fmt: skip
     return rows
 
 

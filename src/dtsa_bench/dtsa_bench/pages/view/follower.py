@@ -5,25 +5,25 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Swarm, make_scenario
+from dtsa_agent.core import make_scenario
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import split_frames, unpack_received
+from dtsa_bench.log.arrays import recorded_config
+from dtsa_bench.log.replay import TableReplay
 from dtsa_bench.runs.config import RunConfig
-from dtsa_bench.runs.delivery import DeliveryCounts, OncePerFault
-from dtsa_bench.runs.metrics import metrics_tables
+from dtsa_bench.runs.delivery import OncePerFault
 
-from .history import MAX_BELIEVERS, MomentBuilder, RunHistory, run_info
-from .page_commands import PROCESS_COMMANDS
+from .history import MAX_BELIEVERS, PROCESS_COMMANDS, MomentBuilder, RunHistory
 
 _MAX_CRASH_AGENTS = 100  # in larger swarms no crashes are detected
 _FARTHEST_M = 1e6
-_PERIOD_NS = 50_000_000  # simulated, from one moment to the next
 _SLOTS = 64  # whose frames wait for the channel's verdict
 
 
@@ -52,13 +52,15 @@ class Follower:
         """
         if self._run is not None:
             return
-        run = RunConfig.from_dict(dict(settings) if "swarm" in settings else {"swarm": dict(settings)})
+        run = recorded_config(settings)
         self._run, self.scenario, self.agents = run, make_scenario(run.swarm), run.swarm.agents
-        self._tables = self._make_tables(run)
-        self._hearing, self._delivery_fault = DeliveryCounts(self.agents), OncePerFault(run.swarm.slot_ns)
+        self._replay: TableReplay | None = None
+        if self.agents <= MAX_BELIEVERS:
+            with suppress(DtsaError):  # frames with a key that is not here, or a policy that is not installed
+                self._replay = TableReplay(run, self.scenario, everyone=True)
+        self._delivery_fault = OncePerFault(run.swarm.slot_ns)
         self._slot_ns = run.swarm.slot_ns
-        self._period = max(1, round(_PERIOD_NS / self._slot_ns))  # slots from one moment to the next
-        self._builder = MomentBuilder(self.scenario, run.air)
+        self._builder = MomentBuilder(self._history, run, self.scenario, self._more)
         self._position = np.array(self.scenario.start)  # (3, N) m
         self._chosen = np.zeros(self.agents, np.uint16)
         self._digest = np.zeros(self.agents, np.uint32)
@@ -66,19 +68,9 @@ class Follower:
         self._frames: dict[int, dict[int, bytes]] = {}  # by slot and sender, until the slot's verdict is there
         self._slot = 0  # the slot that is under way
         self._next = 0  # first slot of the next moment
-        self._absent: frozenset[int] = frozenset()
         self._crashed: set[tuple[int, int]] = set()
         self._lag_ms = 0.0
         self._pairs = np.triu_indices(self.agents, 1)
-        self._history.start_run(run_info(self._history.name, run, self.scenario) | self._more)
-
-    def _make_tables(self, run: RunConfig) -> Swarm | None:
-        if run.swarm.agents > MAX_BELIEVERS:
-            return None
-        try:
-            return metrics_tables(run, self.scenario, everyone=True)
-        except DtsaError:
-            return None  # frames with a key that is not here, or a policy that is not installed
 
     def receive(self, kind: str, message: Any) -> None:
         """Receive a message; `kind` is its type without the package, as ``Reception``."""
@@ -139,35 +131,28 @@ class Follower:
         self._index(senders)
         mask = unpack_received(bytes(np.asarray(message.received, np.uint8)), len(senders), self.agents)
         if slot >= self._next:
-            self._next = slot + self._period
+            self._next = slot + self._builder.period
             self._add_moment(slot)
         frames = self._frames.pop(slot, {})
-        if self._tables is not None:
-            self.scenario.advance(slot, self._tables)
+        if self._replay is not None:
             # A frame that no agent received is not delivered, and none that a listener has missed.
             known = [row for row, sender in enumerate(senders) if sender in frames or not mask[row].any()]
             if known or not senders:
-                self._hearing.add_slot(len(known), mask[known])
-            for row, sender in enumerate(senders):
-                if sender in frames and mask[row].any() and self._tables.hear(slot, frames[sender], mask[row]):
-                    self._hearing.add_accepted(mask[row])
-            self._tables.end(slot)
+                self._replay.delivery.add_slot(len(known), mask[known])
+            arrived = [row for row in known if mask[row].any()]
+            self._replay.step(slot, [(slot, frames[senders[row]], mask[row]) for row in arrived])
         self._builder.add_frames(slot, int(message.outcome), senders, self._reason, mask.astype(bool))
-        present = np.ones(self.agents, bool)
-        present[[agent - 1 for agent in self._absent]] = False
-        self._builder.add_choices(self._chosen[present])
+        self._builder.add_choices(self._chosen)
         self._slot = slot + 1
 
     def _add_moment(self, slot: int) -> None:
-        if self._tables is not None and self._run is not None:
-            if self._run.swarm.estimator_row.needs_everybody:
-                self._tables.estimate_position[:] = self._position
-            else:
-                self._tables.estimate(slot)
-        if problem := self._delivery_fault.fault_to_report(slot, self._hearing.problem()):
+        tables, problem = None, ""
+        if self._replay is not None:
+            self._replay.estimate(slot, self._position)
+            tables, problem = self._replay.tables, self._replay.delivery.problem()
+        if problem := self._delivery_fault.fault_to_report(slot, problem):
             self._builder.add_event(slot, "bad", problem)
-        more: dict[str, Any] = {"lag_ms": round(self._lag_ms, 2)}
-        self._history.append(self._builder.build(slot, self._tables, self._chosen, self._digest, self._absent, **more))
+        self._builder.append_moment(slot, tables, self._chosen, self._digest, lag_ms=round(self._lag_ms, 2))
 
     def _detect_crashes(self, slot: int) -> None:
         if self.agents > _MAX_CRASH_AGENTS or self.agents < 2 or self._run is None:
@@ -182,12 +167,12 @@ class Follower:
 
     def _receive_status(self, message: Any) -> None:
         """Which agents have fallen silent, and whether the run is over."""
-        slot, lost = int(message.slot), frozenset((self._index(message.lost) + 1).tolist())
-        for agent in sorted(lost - self._absent):
-            self._builder.add_event(slot, "lost", f"cf{agent} has fallen silent")
-        for agent in sorted(self._absent - lost):
-            self._builder.add_event(slot, "back", f"cf{agent} takes part again")
-        self._absent, self._lag_ms = lost, float(message.lag_ms)
+        slot, lost = int(message.slot), set((self._index(message.lost) + 1).tolist())
+        for agent in sorted(lost - self._builder.absent):
+            self._builder.lose(slot, agent, f"cf{agent} has fallen silent")
+        for agent in sorted(self._builder.absent - lost):
+            self._builder.regain(slot, agent, f"cf{agent} takes part again")
+        self._lag_ms = float(message.lag_ms)
         if message.phase == 2 and not self._end_reason:  # RunStatus.ENDED
             self._end_reason = str(message.reason)[:300] or "over"
             self._builder.add_event(slot, "end", f"the run has ended: {self._end_reason}")

@@ -31,8 +31,7 @@ from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.node_process import init_ros, limit_to_machine
 
 from .follower import Follower
-from .history import RunHistory, VehicleStates
-from .page_commands import PageCommand
+from .history import PageCommand, RunHistory, VehicleStates
 
 _POLL_S = 0.02
 _VEHICLES_S = 0.05  # wall time between polls of the vehicles

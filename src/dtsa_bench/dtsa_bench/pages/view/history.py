@@ -1,4 +1,4 @@
-"""What a page shows of a run: moments, built slot by slot, and the history of the last of them."""
+"""What a page shows of a run: moments, built slot by slot, and the history of the last of them; what it commands."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import REASONS, Scenario, Swarm
+from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.pages.html import flatten, pack
 from dtsa_bench.runs.config import RunConfig
-from dtsa_channel_sim import ChannelConfig
 from dtsa_channel_sim.model.schedule import scheduled_changes
 
 MAX_MOMENTS = 12_000  # in a history: ten minutes at 20 a second
@@ -26,6 +26,7 @@ MAX_POSITIONS = 400  # likewise
 MAX_EVENTS = 100  # likewise
 MAX_BELIEVERS = 100  # agents: of larger swarms a page does not get what each believes about each
 UNKNOWN = 65535  # an age that is not known
+_PERIOD_NS = 50_000_000  # simulated, from one moment to the next
 _AGE_STEPS = 10  # mean ages are in tenths of slots
 _MM = 1000.0  # believed positions are in mm
 _FARTHEST = 32767
@@ -137,14 +138,21 @@ class RunHistory:
 
 
 class MomentBuilder:
-    """Collects what happens in a run until the next moment is built; all that it holds is bounded.
+    """Collects what happens in a run until its next moment, and adds that to a history; all that it holds is bounded.
 
-    :param channel: settings whose scheduled changes become events; None: there are none.
+    :param info: further values for the page.
+    :param absent: ids of agents that do not take part yet.
     """
 
-    def __init__(self, scenario: Scenario, channel: ChannelConfig | None = None) -> None:
-        self._scheduled = deque([] if channel is None else scheduled_changes(channel))
-        self.agents = scenario.start.shape[1]
+    def __init__(
+        self, history: RunHistory, run: RunConfig, scenario: Scenario, info: dict[str, Any],
+        absent: Collection[int] = (),
+    ) -> None:  # fmt: skip
+        history.start_run(run_info(history.name, run, scenario) | info)
+        self._history, self._scheduled = history, deque(scheduled_changes(run.air))
+        self.agents, self.absent = run.swarm.agents, set(absent)
+        #: Slots from one moment to the next.
+        self.period = max(1, round(_PERIOD_NS / run.swarm.slot_ns))
         self._moving = scenario.moving
         self._frames: deque[tuple[int, int, int, int, int]] = deque(maxlen=MAX_FRAMES)  # the columns of `_FRAME`
         self._positions: deque[tuple[int, Floats]] = deque(maxlen=MAX_POSITIONS)
@@ -167,7 +175,8 @@ class MomentBuilder:
             self._frames.append((slot, sender, outcome, reason.item(sender - 1), share))
 
     def add_choices(self, chosen: NDArray[Any]) -> None:
-        """Add the senders (ids) that the agents which take part choose for a slot."""
+        """Add the senders (ids) that the agents choose for a slot; of those that take part it counts."""
+        chosen = self._present(chosen)
         if len(chosen):
             self._compared += 1
             self._same += bool((chosen == chosen[0]).all())
@@ -180,45 +189,46 @@ class MomentBuilder:
         """Add a line for people; `kind` is the page's style: note, lost, back, air, bad, end."""
         self._events.append((slot, kind, text))
 
+    def lose(self, slot: int, agent: int, text: str) -> None:
+        """Add that an agent (id) does not take part any more."""
+        self.absent.add(agent)
+        self.add_event(slot, "lost", text)
+
+    def regain(self, slot: int, agent: int, text: str) -> None:
+        """Add that an agent (id) takes part again."""
+        self.absent.discard(agent)
+        self.add_event(slot, "back", text)
+
     def add_crash(self, slot: int, pair: tuple[int, int], distance_m: float) -> None:
         """Add that two agents (ids) have crashed."""
         self._crashes.append((slot, *pair, round(distance_m, 4)))
 
-    def build(
-        self,
-        slot: int,
-        tables: Swarm | None,
-        chosen: NDArray[Any],
-        digest: NDArray[Any] | None,
-        absent: Collection[int] = (),
-        **more: Any,
-    ) -> Moment:
-        """Return all that was added since the last moment, and what the agents know now.
+    def append_moment(
+        self, slot: int, tables: Swarm | None, chosen: NDArray[Any], digest: NDArray[Any] | None, **more: Any
+    ) -> None:
+        """Add a moment: all that was added since the last one, and what the agents know now.
 
         :param slot: the slot that starts.
         :param tables: one table an agent, with the estimates for this time; None: not known.
         :param chosen: (N,) ids of the senders that the agents choose.
         :param digest: (N,) digests of their tables; None: not known.
-        :param absent: ids of agents that have fallen silent.
         :param more: further values for the page.
         """
         while self._scheduled and self._scheduled[0].slot <= slot:
             change = self._scheduled.popleft()
             values = ", ".join(f"{name} is {value!r}" for name, value in change.values)
             self.add_event(change.slot, "air", f"{values} from now on")
-        present = np.ones(self.agents, bool)
-        present[[agent - 1 for agent in absent]] = False
         rows = np.array(self._frames, np.int64).reshape(-1, len(_FRAME))
         content = {
             "slot": slot,
             "at": pack(np.array([at for at, _ in self._positions], "<u4")),
             "place": pack(np.array([position for _, position in self._positions], "<f4")),
             "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(_FRAME)},
-            "tables": 0 if digest is None else len(set(digest[present].tolist())),
+            "tables": 0 if digest is None else len(set(self._present(digest).tolist())),
             "chosen": pack(chosen.astype("<u2")),
             "age": pack(self._mean_ages(slot, tables)),
             "agree": [self._compared, self._same],
-            "absent": sorted(absent),
+            "absent": sorted(self.absent),
             "events": list(self._events),
             "crashes": list(self._crashes),
             **more,
@@ -229,7 +239,11 @@ class MomentBuilder:
         for collected in (self._frames, self._positions, self._events, self._crashes):
             collected.clear()
         self._compared = self._same = 0
-        return Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed)
+        self._history.append(Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed))
+
+    def _present(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Those of values by agent that are of agents which take part."""
+        return np.delete(values, [agent - 1 for agent in self.absent])
 
     def _mean_ages(self, slot: int, tables: Swarm | None) -> NDArray[np.uint16]:
         """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move."""
@@ -252,3 +266,44 @@ def _beliefs(slot: int, sent_slot: NDArray[np.int64], estimate: Floats) -> tuple
     age[sent_slot < 0] = UNKNOWN
     place = np.nan_to_num(estimate, nan=0.0) * _MM  # not a number: of an agent never heard
     return age.tobytes(), np.rint(np.clip(place, -_FARTHEST, _FARTHEST)).astype("<i2").tobytes()
+
+
+# -- what a page may command, where the user has allowed it -----------------------------------------------------------
+PROCESS_COMMANDS = ("kill", "start")  # of an agent's process, by a flight in real time
+CONFIRMATION = "stop all motors"  # value of an emergency stop: it is never commanded by accident
+_MAX_LENGTH = 2000  # characters of a partition
+
+
+@dataclass(frozen=True, slots=True)
+class PageCommand:
+    """One command of a page."""
+
+    kind: str
+    value: float | bool | str | None = None
+
+
+# By kind: whether a value is valid, and which values are.
+_VALUES = {
+    **dict.fromkeys(PROCESS_COMMANDS, (lambda value: type(value) is int and 1 <= value <= 65535, "the id of an agent")),
+    "loss": (lambda value: type(value) in (int, float) and 0.0 <= value <= 1.0, "0 to 1"),
+    "jam": (lambda value: type(value) is bool, "true or false"),
+    "partition": (
+        lambda value: type(value) is str and len(value) <= _MAX_LENGTH, "groups of ids, as [[1, 2, 3], [4, 5, 6]]"
+    ),
+    "land": (lambda value: value is None, "nothing"),
+    "emergency": (lambda value: value == CONFIRMATION, f"{CONFIRMATION!r}, the second step"),
+}  # fmt: skip
+
+
+def parse_command(content: Any) -> PageCommand:
+    """Return the command in decoded JSON of a page; whether it can be carried out is not known yet.
+
+    :raises ConfigError: if it is none.
+    """
+    if not isinstance(content, dict) or content.get("kind") not in _VALUES:
+        raise ConfigError("command", str(content)[:80], f"one of {', '.join(_VALUES)}")
+    kind, value = content["kind"], content.get("value")
+    is_valid, allowed = _VALUES[kind]
+    if not is_valid(value):
+        raise ConfigError(kind, str(value)[:80], allowed)
+    return PageCommand(kind, float(value) if kind == "loss" else value)

@@ -31,10 +31,9 @@ from dtsa_bench.pages.html import pack
 from dtsa_bench.runs.config import REALTIME, RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS
 
-from .history import UNKNOWN, MomentBuilder, RunHistory, run_info
+from .history import UNKNOWN, MomentBuilder, RunHistory
 
 _POLL_S = 0.02
-_PERIOD_NS = 50_000_000  # from one moment to the next
 _BURST = 64  # datagrams at a time: however many arrive, time goes on
 _OPEN_SLOTS = 2  # for frames that come late
 _SILENCE_NS = 2_000_000_000  # after this a frame of an earlier time is of a swarm that was restarted
@@ -52,23 +51,21 @@ class ListenedRun:
     """
 
     def __init__(self, history: RunHistory, config: SwarmConfig, port: str, first: int, zero_ns: int) -> None:
-        self._history, self._config = history, config
+        self._config = config
         self.slot, self.zero_ns, self.received_ns = first, zero_ns, 0
         self._scenario = make_scenario(config)
         self._tables = make_swarm(config, self._scenario, local=[], observers=[0])
-        self._builder = MomentBuilder(self._scenario)
+        listener = {"live": True, "control": False, "mode": port, "listener": True}
+        run, everybody = RunConfig(config, mode=REALTIME), range(1, config.agents + 1)
+        self._builder = MomentBuilder(history, run, self._scenario, listener, absent=everybody)
         self._rules = RuleChecker(config)
         self._frames: dict[int, dict[int, tuple[bytes, bytes]]] = {}  # by slot, sender: with and without its tag
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
-        self._absent = set(range(1, config.agents + 1))
         self._lost: dict[int, int] = {}  # slot since when, of agents that were heard before
         self._quiet = slots_until_all_known(config)  # slots, in which every agent has had a turn
         self._late_ns: deque[int] = deque(maxlen=_LATENESS)
-        self._period = max(1, round(_PERIOD_NS / config.slot_ns))  # slots from one moment to the next
         self._no_choice = np.zeros(config.agents, np.uint16)  # only the agents know whom they choose
         self._no_reason = np.full(config.agents, _NO_REASON, np.uint8)
-        listener = {"live": True, "control": False, "mode": port, "listener": True}
-        history.start_run(run_info(history.name, RunConfig(config, mode=REALTIME), self._scenario) | listener)
 
     def receive(self, datagram: ParsedDatagram, signed: bytes, zero_ns: int, now_ns: int) -> str:
         """Accept the frame of a slot that is still open; return why not, or an empty text.
@@ -95,7 +92,7 @@ class ListenedRun:
         """Close the slots that are over; `refused`: datagrams that were not accepted so far, by reason."""
         end = (now_ns - self.zero_ns) // self._config.slot_ns - _OPEN_SLOTS
         while self.slot < end:
-            if self.slot % self._period == 0:
+            if self.slot % self._builder.period == 0:
                 self._add_moment(refused)
             self._close_slot(self.slot)
             self.slot += 1
@@ -105,7 +102,7 @@ class ListenedRun:
         self._builder.add_positions(self.slot, self._positions())
         late = statistics.median(self._late_ns) / 1e6 if self._late_ns else 0.0
         more = {"lag_ms": round(late, 2), "refused": refused.total(), "age": pack(self._ages())}
-        self._history.append(self._builder.build(self.slot, self._tables, self._no_choice, None, self._absent, **more))
+        self._builder.append_moment(self.slot, self._tables, self._no_choice, None, **more)
 
     def _positions(self) -> NDArray[np.float64]:
         """(3, N) m, frame map, where the agents are: those that are lost where the last frame left them."""
@@ -142,9 +139,8 @@ class ListenedRun:
     def _note_presence(self, slot: int, sender: int, frame: bytes) -> None:
         """Note that an agent is heard, and whether it leaves."""
         self._lost.pop(sender, None)
-        if sender in self._absent:
-            self._absent.discard(sender)
-            self._builder.add_event(slot, "back", f"cf{sender} is heard")
+        if sender in self._builder.absent:
+            self._builder.regain(slot, sender, f"cf{sender} is heard")
         self._last[sender] = slot
         config = self._config
         if config.policy_row.says_leaving and decode_extended(config.protocol_part(frame), config.extent_m).leaving:
@@ -152,9 +148,8 @@ class ListenedRun:
 
     def _lose(self, slot: int, agent: int, text: str) -> None:
         del self._last[agent]
-        self._absent.add(agent)
         self._lost[agent] = slot
-        self._builder.add_event(slot, "lost", text)
+        self._builder.lose(slot, agent, text)
 
 
 class NetworkListener:

@@ -19,8 +19,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.pages.html import PALETTE, SCRIPTS, asset, render_page
 
-from .history import MAX_BELIEVERS, RunHistory, VehicleStates
-from .page_commands import PageCommand, parse_command
+from .history import MAX_BELIEVERS, PageCommand, RunHistory, VehicleStates, parse_command
 
 LOOPBACK = "127.0.0.1"
 RATE_HZ = 20.0  # messages a second to one page, at most

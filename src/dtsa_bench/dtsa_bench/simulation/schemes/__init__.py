@@ -6,14 +6,11 @@ Each is announced by entry point in the group ``dtsa.policies``, so ``--policy g
 `sweep`, and in nodes where its kind allows it.
 """
 
-from .contention import Dominance, ThresholdAloha
+from .contention import Dominance, Sense, ThresholdAloha, ThresholdAoii
 from .dtr import Dtr
-from .event_tdma import EventTdma
 from .genie import GenieAge, GenieError, GenieInnovation, Whittle
 from .mixer import Mixer
-from .sense import Sense
-from .sotdma import Sotdma
-from .threshold_aoii import ThresholdAoii
+from .tdma import EventTdma, Sotdma
 from .unslotted import Beacons, Csma, PureAloha
 
 __all__ = [

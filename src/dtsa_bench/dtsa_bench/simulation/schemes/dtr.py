@@ -20,16 +20,12 @@ _IDLE, _WAIT_CTS, _WAIT_RTS, _WAIT_ACK = range(4)
 class Dtr:
     """A static ring in the order of ids (crazyflie-firmware, ``src/modules/src/p2pDTR/token_ring.c``).
 
-    Who has the token sends its frame to each other agent in turn, as a packet of its own that this agent alone takes in
-    and acknowledges. Then it offers the token (TOKEN), its successor asks for it (RTS), gets it (CTS), and sends. What
-    is not answered is sent again every 20 ms: the firmware names 10, 11 and 12 ms, but never sets its timer to them.
-    Who hears nothing for 4 s begins anew, but for id 1, with whose turn the ring starts. At most 20 agents.
+    The agent with the token sends its frame to each other agent separately, which acknowledges it; then it offers the
+    token (TOKEN), its successor asks for it (RTS), gets it (CTS), and sends. What is not answered is sent again. An
+    agent that hears nothing for 4 s starts anew, but for id 1, with whose turn the ring starts. At most 20 agents.
 
-    Options: ``dtr.react_ms`` (0.3: from the arrival of a packet until the answer is at the radio, the link between both
-    processors) and ``dtr.resend_ms`` (20). Each packet has the newest state; the firmware takes what an application has
-    queued. All always have something to say.
-
-    :raises ConfigError: for more agents than the firmware allows.
+    Options: ``dtr.react_ms`` (0.3: from the arrival of a packet until the answer is at the radio) and ``dtr.resend_ms``
+    (20: the firmware names 10, 11 and 12 ms, but never sets its timer to them).
     """
 
     options = ("react_ms", "resend_ms")
@@ -61,11 +57,8 @@ class Dtr:
             self._state, self._packet = _IDLE, None
         if self._packet is not None and now_ns >= self._due_ns:
             kind, target = self._packet
-            sent = (
-                radio.send(self._note(kind, target), target)
-                if kind == _DATA
-                else radio.send_note(self._note(kind, target))
-            )
+            note = self._note(kind, target)
+            sent = radio.send(note, target) if kind == _DATA else radio.send_note(note)
             self._due_ns = now_ns + (self._resend_ns if sent else _RETRY_NS)
             if sent and self._state == _IDLE:
                 self._packet = None  # CTS and acknowledgements are sent once

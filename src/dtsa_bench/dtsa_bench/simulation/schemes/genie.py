@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 
 from .knowledge import ages, counts, moves, squared_errors, whittle_index
 
 
+def heaviest(weight: NDArray[np.float64], slot: int) -> list[int]:
+    """The id with the largest weight; where no agent has any, the slot's owner under TDMA."""
+    best = int(weight.argmax())
+    return [best + 1 if weight[best] > 0 else slot % len(weight) + 1]
+
+
 class GenieAge:
     """The agent with the largest sum of true ages at all receivers, over pairs that count as movers.
 
-    Greedy. For one base station and equal links greedy is optimal (Kadota and others, arXiv 1801.01803); here, where
-    all send to all, it is a reference and no proven optimum (compared for three agents in docs/evidence/league.md).
+    For one base station and equal links greedy is optimal (Kadota and others, arXiv 1801.01803); here it is no optimum.
     """
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         del config, agent
 
     def senders(self, swarm: Swarm, slot: int) -> list[int]:
-        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
-        weight = np.where(counts(swarm), ages(swarm, slot), 0.0).sum(axis=0)
-        best = int(weight.argmax())
-        return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
+        """One id."""
+        return heaviest(np.where(counts(swarm), ages(swarm, slot), 0.0).sum(axis=0), slot)
 
 
 class GenieInnovation:
@@ -38,24 +42,19 @@ class GenieInnovation:
         self._cap = config.age_cap
 
     def senders(self, swarm: Swarm, slot: int) -> list[int]:
-        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        """One id."""
         pairs = counts(swarm)
         age = np.where(pairs, ages(swarm, slot), 0.0).sum(axis=0)
         mean = age / np.maximum(pairs.sum(axis=0), 1)
         if self._cap and mean.max() >= self._cap * np.count_nonzero(moves(swarm)) > 0:
             return [int(mean.argmax()) + 1]
-        weight = age * (0.02 + np.diagonal(swarm.innovation))
-        best = int(weight.argmax())
-        return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
+        return heaviest(age * (0.02 + np.diagonal(swarm.innovation)), slot)
 
 
 class Whittle:
-    """The agent with the largest sum of Whittle's indices of the true ages at all receivers.
+    """The agent with the largest sum of Whittle's indices of the true ages at all receivers, each that of one link.
 
-    The index is that of one link; a frame that reaches several receivers counts the sum of theirs. Option:
-    ``whittle.loss`` (0): the probability that a receiver loses a frame, which has to be known.
-
-    :raises ConfigError: for a probability that is none.
+    Option: ``whittle.loss`` (0): the probability that a receiver loses a frame, which has to be known.
     """
 
     options = ("loss",)
@@ -67,11 +66,9 @@ class Whittle:
             raise ConfigError("whittle.loss", self._loss, "0 to below 1")
 
     def senders(self, swarm: Swarm, slot: int) -> list[int]:
-        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        """One id."""
         index = whittle_index(ages(swarm, slot) + 1.0, self._loss)
-        weight = np.where(counts(swarm), index, 0.0).sum(axis=0)
-        best = int(weight.argmax())
-        return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
+        return heaviest(np.where(counts(swarm), index, 0.0).sum(axis=0), slot)
 
 
 class GenieError:
@@ -85,7 +82,7 @@ class GenieError:
         del config, agent
 
     def senders(self, swarm: Swarm, slot: int) -> list[int]:
-        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        """One id."""
         pairs = counts(swarm)
         if not pairs.any():
             return [slot % swarm.config.agents + 1]

@@ -1,4 +1,4 @@
-"""What one who looks into all agents can say of ages and errors."""
+"""Ages and errors of agents that have tables of their own, and what an agent can tell by itself."""
 
 from __future__ import annotations
 
@@ -15,31 +15,21 @@ Floats = NDArray[np.float64]
 
 
 def moves(swarm: Swarm) -> Mask:
-    """Which agents are under way: (N,), present and further than r_min from where they fly to.
-
-    :param swarm: all agents.
-    """
+    """Which agents are under way: (N,), present and further than r_min from where they fly to."""
     away = swarm.goal - swarm.position
     far = (away * away).sum(axis=0) > swarm.config.r_min**2
     return np.asarray(far & (swarm.present > 0))
 
 
 def has_arrived(table: Table, r_min: float) -> bool:
-    """Whether an agent is where it flies to: what it can tell by itself.
-
-    :param table: what it knows.
-    :param r_min: m, distance at which it has arrived.
-    """
+    """Whether an agent is where it flies to: what it can tell by itself. ``r_min``: m, closer it has arrived."""
     assert table.own_position is not None
     assert table.goal is not None
     return math.dist(table.own_position, table.goal) <= r_min
 
 
 def counts(swarm: Swarm) -> Mask:
-    """Which pairs count: (N, N), observer by agent: the agent moves, or the observer still takes it for a mover.
-
-    :param swarm: all agents, each with a table of its own.
-    """
+    """Which pairs count: (N, N), observer by agent: the agent moves, or the observer still takes it for a mover."""
     there = swarm.present > 0
     pairs = (swarm.in_ap > 0) | moves(swarm)[None, :]
     pairs &= there[:, None] & there[None, :]
@@ -50,29 +40,20 @@ def counts(swarm: Swarm) -> Mask:
 def ages(swarm: Swarm, slot: int) -> Floats:
     """Ages at the start of a slot: (N, N) slots, observer by agent; 0: heard in the slot that has just ended.
 
-    :param swarm: all agents, each with a table of its own.
-    :param slot: the slot that begins. Who was never heard counts as heard before slot 0.
+    An agent that was never heard counts as heard before slot 0.
     """
     return (slot - 1 - swarm.sent_slot).astype(np.float64)
 
 
 def squared_errors(swarm: Swarm, slot: int) -> Floats:
-    """Squared errors of all estimates at the start of a slot: (N, N) m^2, observer by agent.
-
-    :param swarm: all agents, each with a table of its own.
-    :param slot: the slot that begins.
-    """
+    """Squared errors of all estimates at the start of a slot: (N, N) m^2, observer by agent."""
     swarm.estimate(slot)
     off = swarm.estimate_position - swarm.position[None]
     return np.asarray((off * off).sum(axis=1))
 
 
 def error_about_self(swarm: Swarm, slot: int) -> Floats:
-    """How far each agent is from where its last frame, moved on, puts it: (N,) m. Each can tell that by itself.
-
-    :param swarm: all agents, each with a table of its own.
-    :param slot: the slot that begins.
-    """
+    """How far each agent is from where its last frame, moved on, puts it: (N,) m. Each can tell that by itself."""
     n = np.arange(swarm.config.agents)
     age_s = (slot - swarm.sent_slot[n, n]) * swarm.config.slot_s
     moved = swarm.sent_position[n, :, n].T + swarm.sent_velocity[n, :, n].T * age_s

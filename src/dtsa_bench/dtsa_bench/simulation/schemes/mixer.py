@@ -23,11 +23,7 @@ class FrameSolver:
         self.rows: dict[int, tuple[int, int]] = {}  # by the highest bit of the vector: vector, sum of the frames
 
     def add(self, vector: int, mixed: int) -> None:
-        """Takes in a combination; one that says nothing new is dropped.
-
-        :param vector: bit k - 1: the frame of agent k is in it.
-        :param mixed: sum of these frames, modulo 2.
-        """
+        """Add the sum of some frames, modulo 2; bit k - 1 of ``vector``: that of agent k is in it."""
         while vector:
             first = vector.bit_length() - 1
             row = self.rows.get(first)
@@ -51,21 +47,14 @@ class FrameSolver:
 class Mixer:
     """Rounds of packets; each packet is a random sum, modulo 2, of the frames that its sender has heard of.
 
-    A round begins with a slot, and carries the states of that instant. It has ``mixer.slots_per_agent`` N slots of its
-    own, each as long as one packet; agents own them in turn, the owner sends, the others listen. An agent's first
-    packet contains its own frame for certain. Frames are taken in at the end of the round, as far as what was heard can
-    be solved for them. Every packet goes over the medium like any other one: it may be lost, or collide.
+    A round begins with a slot, and carries the states of that instant. It has ``mixer.slots_per_agent`` (2) N slots of
+    its own, each as long as one packet (``mixer.slot_us``: what a packet takes an nRF, and 31 us); agents own them in
+    turn. An agent's first packet contains its own frame for certain. Frames are received at the end of the round, as
+    far as what was heard can be solved for them. ``mixer.period_ms``: from round to round, whole slots; as many packets
+    as TDMA has frames.
 
-    Sources: Mixer (arXiv 1804.08986), a derivative of whose code says who sends when: the owner of a slot, and in slots
-    of others nobody while their owner is in reach; DMPC-Swarm (arXiv 2508.20553), with slots of 0.53 ms. Not here:
-    synchronous transmissions, by which Mixer spans several hops (its helpers send at the same time, and the capture
-    effect lets one of them be received); requests for missing frames; the early end of a round.
-
-    Options: ``mixer.slots_per_agent`` (2; DMPC-Swarm has 5.2 for several hops), ``mixer.slot_us`` (default: what a
-    packet takes an nRF, and 31 us) and ``mixer.period_ms`` (from round to round, whole slots, at least a round;
-    default: as many packets as TDMA has frames).
-
-    :raises ConfigError: for less than one slot an agent.
+    Mixer (arXiv 1804.08986), DMPC-Swarm (arXiv 2508.20553: 5.2 slots an agent for several hops). Not here: synchronous
+    transmissions, requests for missing frames, the early end of a round.
     """
 
     options = ("period_ms", "slot_us", "slots_per_agent")

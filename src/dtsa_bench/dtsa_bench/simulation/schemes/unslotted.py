@@ -19,10 +19,8 @@ def _random(config: SwarmConfig, agent: int, stream: int) -> np.random.Generator
 
 
 class Beacons:
-    """Every agent sends at a fixed rate, whoever else sends: each by its own timer, which begins at random.
+    """Every agent sends at a fixed rate, by a timer of its own that begins at random (Bitcraze's decentralised demo).
 
-    As in Bitcraze's decentralised demo (crazyflie-firmware-experimental, ``examples/demos/decentralized_swarm``):
-    10 Hz, no jitter, at most nine Crazyflies. Whose timers begin within one frame of each other collide for good.
     Options: ``beacons.period_ms`` (N slots: as many frames as TDMA; the demo's is 100) and ``beacons.jitter_ms`` (0: of
     each period, up to so much more or less).
     """
@@ -73,13 +71,11 @@ class PureAloha:
 
 
 class Csma:
-    """Non-persistent carrier sense (Kleinrock and Tobagi 1975) whose back-off shrinks with the age of one's last frame.
+    """Non-persistent carrier sense (Kleinrock and Tobagi 1975) whose back-off shrinks with the age of its last frame.
 
-    Who finds the air free at the end of its wait sends, and waits for half to one and a half periods; who finds it in
-    use waits again, for a time drawn from zero to a window that shrinks with the age of its own last frame. Two that
-    begin within the turn-round of a radio do not sense each other. Agents at rest send every tenth period. Options:
-    ``csma.period_ms`` (N slots: at most as many frames as TDMA) and ``csma.window_ms`` (N times 0.25 ms, for an own
-    frame one period old).
+    Where the air is free at the end of a wait, it sends, and waits for half to one and a half periods; else it waits
+    from zero to a window divided by the age of its last frame in periods. Agents at rest send every tenth period.
+    Options: ``csma.period_ms`` (N slots) and ``csma.window_ms`` (N times 0.25 ms).
     """
 
     options = ("period_ms", "window_ms")

@@ -49,7 +49,7 @@ class DongleModel:
         self._ard, self._arc, self._ack = 0xA0, 3, True
         self.sniffer.stop()
 
-    def request(self, number: int, value: int, index: int, data: bytes, now: int) -> None:
+    def request(self, number: int, value: int, data: bytes, now: int) -> None:
         """A vendor request from the host; what is not known is ignored."""
         self._busy_ns = max(now, self._busy_ns) + round(self._settings.request_ms * 1e6)
         first, second = self._tuning.addresses

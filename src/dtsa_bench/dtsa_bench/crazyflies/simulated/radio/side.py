@@ -122,8 +122,8 @@ class RadioServer:
     def _use(self, dongle: DongleModel, host: _Host, message: bytes) -> None:
         kind = message[0]
         if kind == REQUEST and len(message) >= _REQUEST.size:
-            _, number, value, index = _REQUEST.unpack_from(message)
-            dongle.request(number, value, index, message[_REQUEST.size :], self.now_ns())
+            _, number, value, _ = _REQUEST.unpack_from(message)
+            dongle.request(number, value, message[_REQUEST.size :], self.now_ns())
         elif kind == PACKET and len(message) > 1:
             dongle.transfer(message[1:], self.now_ns(), host.send)
         elif kind == READ:

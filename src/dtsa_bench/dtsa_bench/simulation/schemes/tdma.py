@@ -1,4 +1,4 @@
-"""SOTDMA, the self-organised TDMA of ships (AIS)."""
+"""TDMA of other kinds: self-organised as that of ships (AIS), and triggered by events."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.plugins.entry_points import Table
 from dtsa_agent.core.swarm import SlotOutcome
 
+from .knowledge import has_arrived
+
 _TIMEOUTS = (3, 8)  # frames of reports a slot is kept for: drawn from 3 to 7
 _LEAST = 4  # slots to choose from, even if some are in use
 _SELECTION = 0.2  # of the nominal increment
@@ -19,16 +21,11 @@ class Sotdma:
     """Each frame announces when its sender comes next and for how long it will keep that rhythm (ITU-R M.1371).
 
     Time has frames of L slots, one report of each agent in each. An agent listens to one frame, then enters with a slot
-    drawn from those it has not heard taken, near its nominal one. It keeps the slot for 3 to 7 frames; the last report
-    in it announces another one, drawn within 0.2 L around it from at least four that are free. Three own bytes: reports
-    left, and offset to the next one. Collisions are not noticed; they end with the slot's time-out.
+    drawn from free ones near its nominal one, and keeps it for 3 to 7 frames; the last report announces another one,
+    within 0.2 L. Three own bytes: reports left, and offset to the next one. Collisions end with the slot's time-out.
 
-    Options: ``sotdma.load`` (0.5), N / L: with more, less is free to choose from; with less, reports are rare.
-    ``sotdma.entry`` (0), 1: the first report has no slot of its own near the nominal one. It begins at a random slot of
-    the second frame, by random access (RATDMA): in each of four free slots it is sent with a probability that grows:
-    1/4, 1/2, 3/4, 1. Slots that others have announced meanwhile are not free. It announces the slot of the next report,
-    as in the network entry of the source. A summary of that was read and not the text; how the probability grows is
-    assumed.
+    Options: ``sotdma.load`` (0.5), N / L. ``sotdma.entry`` (0), 1: the first report is sent by random access (RATDMA)
+    in one of four free slots from a random one of the second frame on, with probability 1/4, 1/2, 3/4, 1 (assumed).
     ``sotdma.reuse`` (0), 1: an agent that finds no free slot near the nominal one takes that of the agent farthest away
     instead of looking farther afield, as STDMA of vehicles does.
     """
@@ -117,3 +114,39 @@ class Sotdma:
             return
         self._next = slot + self._offset
         self._left = self._left - 1 if self._left else int(self._random.integers(*_TIMEOUTS))
+
+
+class EventTdma:
+    """TDMA in which the owner is silent while its last frame, moved on, is right to within some distance.
+
+    After the wireless control bus, arXiv 2101.10961. Options: ``event-tdma.error_m`` (0.05), ``event-tdma.rounds`` (10:
+    the longest silence).
+    """
+
+    options = ("error_m", "rounds")
+    may_join = True
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        self._agents, self._agent, self._slot_s = config.agents, agent, config.slot_s
+        self._r_min = config.r_min
+        self._hold = config.estimator == "hold"
+        self._error = config.options.get("event-tdma.error_m", 0.05)
+        self._silence = config.options.get("event-tdma.rounds", 10.0) * config.agents
+
+    def choose(self, table: Table, slot: int) -> int:
+        """The owner; who is the owner and has nothing to say, nobody."""
+        owner = slot % self._agents + 1
+        return owner if owner != self._agent or self._must_send(table, slot) else 0
+
+    def _must_send(self, table: Table, slot: int) -> bool:
+        own = self._agent - 1
+        sent = int(table.sent_slot[own])
+        if sent < 0 or slot - sent >= self._silence:
+            return True
+        if has_arrived(table, self._r_min) == bool(table.in_ap[own]):
+            return True  # has set out, or has arrived, and not said so yet
+        moved = table.sent_position[:, own]
+        if not self._hold:
+            moved = moved + table.sent_velocity[:, own] * ((slot - sent) * self._slot_s)
+        assert table.own_position is not None
+        return math.dist(table.own_position, moved) > self._error
