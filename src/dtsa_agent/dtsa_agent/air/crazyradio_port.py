@@ -1,23 +1,34 @@
-"""A Crazyradio 2.0 in sniffer mode as the port of an agent: broadcasts between Crazyflies, through pyusb."""
+"""A Crazyradio 2.0 in sniffer mode as the port of an agent: broadcasts between Crazyflies, through pyusb.
+
+Sources: crazyradio2-firmware 5.4, docs/development/compatible-usb-protocol.md; crazyflie2-nrf-firmware.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import importlib.util
+import struct
 import time
 from collections import deque
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.priority import realtime_thread
 
-from . import crazyradio_packets as radio
-from .crazyradio_packets import PacketReader, broadcast, datagram_in
 from .device_port import FAULTS, DevicePort, reason
 from .settings import CrazyradioSettings
 
+VENDOR_OUT, VENDOR_IN = 0x40, 0xC0
+SET_RADIO_CHANNEL, SET_RADIO_ADDRESS, SET_DATA_RATE = 0x01, 0x02, 0x03
+SET_RADIO_MODE, GET_SNIFFER_DROP_COUNT = 0x24, 0x26
+NORMAL, SNIFFER = 0, 1  # modes
+FIRST_FIRMWARE = 0x0504  # of a Crazyradio 2.0 that has sniffer mode
+USB_PACKET = 64  # bytes: a transfer ends with a shorter one
+BROADCAST = bytes.fromhex("FFE7E7E7E7")  # to which Crazyflies send to each other
+_LONGEST_PAYLOAD = 63
+_HEAD = struct.Struct("<BBBI")  # length of all, RSSI, pipe, stamp
+_PEER, _PEER_BITS, _PORT = 0xFF, 0xF3, 0x80
 _VENDOR, _PRODUCT = 0x1915, 0x7777
 _OUT, _IN = 0x01, 0x81
 _READ_MS, _WRITE_MS, _REQUEST_MS = 100, 20, 1000
@@ -37,6 +48,62 @@ _WINDOW = 96  # packets, of which one at least is read without delay
 _OLDEST_NS = 10 * _SECOND  # clocks of crystals differ by less than 1 ms within this time
 _FIT_NS = 10_000_000  # stamps fit each other to this
 _ODD = 3  # stamps in a row that fit each other and no others: the dongle was restarted
+
+
+class RadioPacket(NamedTuple):
+    """A packet that the dongle has heard."""
+
+    payload: bytes
+    rssi_dbm: int
+    pipe: int  # 0 or 1: to which of its two addresses
+    stamp_us: int  # of the dongle's clock when it was whole, 32 bits
+
+
+class PacketReader:
+    """Finds packets in what is read from the dongle.
+
+    A packet begins a transfer, and one longer than 64 bytes may come in two parts. Whatever the bytes are, each call
+    ends, and the next transfer starts from nothing.
+    """
+
+    def __init__(self) -> None:
+        self._rest = b""  # of a packet that goes on
+        self.garbled = 0  # transfers, or ends of these, that are no packets
+
+    def feed(self, data: bytes) -> list[RadioPacket]:
+        """Return the packets that are whole with what one read has given; empty: nothing came for a while."""
+        if not data:
+            self.garbled += bool(self._rest)
+            self._rest = b""
+            return []
+        data, self._rest = self._rest + data, b""
+        packets: list[RadioPacket] = []
+        at = 0
+        while at < len(data) and _HEAD.size <= data[at] <= _HEAD.size + _LONGEST_PAYLOAD:
+            end = at + data[at]
+            if end > len(data):
+                # Only whole USB packets can be followed by more of the same transfer.
+                if len(data) - at == USB_PACKET:
+                    self._rest = data[at:]
+                    return packets
+                break
+            _, rssi, pipe, stamp = _HEAD.unpack_from(data, at)
+            packets.append(RadioPacket(data[at + _HEAD.size : end], -rssi, pipe, stamp))
+            at = end
+        self.garbled += at < len(data)
+        return packets
+
+
+def broadcast(data: bytes, port: int) -> bytes:
+    """Return the transfer that sends a datagram of at most 60 bytes to all Crazyflies, on a port of 0 to 15."""
+    return BROADCAST + bytes((_PEER, _PORT | port)) + data
+
+
+def datagram_in(payload: bytes, port: int) -> bytes | None:
+    """Return the datagram in a packet; None: it is not a broadcast between Crazyflies on this port."""
+    if len(payload) < 2 or payload[0] & _PEER_BITS != _PEER_BITS or payload[1] != _PORT | port:
+        return None
+    return payload[2:]
 
 
 class DongleClock:
@@ -113,7 +180,13 @@ class CrazyradioPort(DevicePort):
 
         device = None
         try:
-            devices = _devices(settings.simulated_radio)
+            backend = None  # pyusb looks for a libusb of the system
+            if importlib.util.find_spec("libusb_package") is not None:
+                import libusb_package
+
+                backend = libusb_package.get_libusb1_backend()
+            found = usb.core.find(idVendor=_VENDOR, idProduct=_PRODUCT, find_all=True, backend=backend)
+            devices = list(found or ())
             if len(address.radio) <= _BY_NUMBER and address.radio.isdigit():
                 matches = devices[int(address.radio) : int(address.radio) + 1]
             else:
@@ -122,18 +195,16 @@ class CrazyradioPort(DevicePort):
                 raise ConfigError("uri", uri, f"a Crazyradio that is plugged in; there are {len(devices)}")
             device = matches[0]
             version = int(device.bcdDevice)
-            if version < radio.FIRST_FIRMWARE:
+            if version < FIRST_FIRMWARE:
                 firmware = f"{uri}: firmware {version >> 8:x}.{version & 0xFF:x}"
                 raise ConfigError("uri", firmware, "a Crazyradio 2.0 with firmware 5.4 or later: it has sniffer mode")
             device.set_configuration(1)
             usb.util.claim_interface(device, 0)
-            _request(
-                device, radio.SET_RADIO_MODE, radio.NORMAL
-            )  # it may have been left otherwise: begin with an empty queue
-            _request(device, radio.SET_RADIO_CHANNEL, address.channel)
-            _request(device, radio.SET_DATA_RATE, address.rate_mbps)
-            _request(device, radio.SET_RADIO_ADDRESS, 0, radio.BROADCAST)
-            _request(device, radio.SET_RADIO_MODE, radio.SNIFFER)
+            _request(device, SET_RADIO_MODE, NORMAL)  # it may have been left otherwise: begin with an empty queue
+            _request(device, SET_RADIO_CHANNEL, address.channel)
+            _request(device, SET_DATA_RATE, address.rate_mbps)
+            _request(device, SET_RADIO_ADDRESS, 0, BROADCAST)
+            _request(device, SET_RADIO_MODE, SNIFFER)
         except usb.core.NoBackendError:
             raise ConfigError("libusb", "not found", f"libusb 1.0: {_HOW}") from None
         except ConfigError:
@@ -151,14 +222,14 @@ class CrazyradioPort(DevicePort):
         import usb.util
 
         with contextlib.suppress(*FAULTS):
-            _request(device, radio.SET_RADIO_MODE, radio.NORMAL)
+            _request(device, SET_RADIO_MODE, NORMAL)
         usb.util.dispose_resources(device)
 
     def _write(self, device: Any, data: bytes) -> None:
         """Send a packet; when it leaves is not known."""
         transfer = broadcast(data, self._settings.p2p_port)
         device.write(_OUT, transfer, _WRITE_MS)
-        if not len(transfer) % radio.USB_PACKET:
+        if not len(transfer) % USB_PACKET:
             device.write(_OUT, b"", _WRITE_MS)
 
     def _read(self, device: Any) -> None:
@@ -169,7 +240,7 @@ class CrazyradioPort(DevicePort):
         while not self._stopped.is_set():
             data = b""
             with contextlib.suppress(usb.core.USBTimeoutError):
-                data = bytes(device.read(_IN, 2 * radio.USB_PACKET, _READ_MS))
+                data = bytes(device.read(_IN, 2 * USB_PACKET, _READ_MS))
             now = time.monotonic_ns()
             for packet in reader.feed(data):
                 arrival_ns = clock.arrival_ns(packet.stamp_us, now)
@@ -180,27 +251,10 @@ class CrazyradioPort(DevicePort):
                     self._queue(datagram, arrival_ns, False)
             if now >= counts_due_ns:
                 counts_due_ns = now + _COUNTS_NS
-                dropped = bytes(
-                    device.ctrl_transfer(radio.VENDOR_IN, radio.GET_SNIFFER_DROP_COUNT, 0, 0, 4, _REQUEST_MS)
-                )
+                dropped = bytes(device.ctrl_transfer(VENDOR_IN, GET_SNIFFER_DROP_COUNT, 0, 0, 4, _REQUEST_MS))
                 counts = int.from_bytes(dropped, "little"), reader.garbled, clock.unusable
                 self._dropped, self._garbled, self._unusable = map(sum, zip(before, counts, strict=True))
 
 
 def _request(device: Any, number: int, value: int, data: bytes = b"") -> None:
-    device.ctrl_transfer(radio.VENDOR_OUT, number, value, 0, data, _REQUEST_MS)
-
-
-def _devices(simulated_radio: str) -> list[Any]:
-    import usb.core
-
-    if simulated_radio:
-        from .crazyradio_simulated import simulated_dongles
-
-        return simulated_dongles(Path(simulated_radio))
-    backend = None  # pyusb looks for a libusb of the system
-    if importlib.util.find_spec("libusb_package") is not None:
-        import libusb_package
-
-        backend = libusb_package.get_libusb1_backend()
-    return list(usb.core.find(idVendor=_VENDOR, idProduct=_PRODUCT, find_all=True, backend=backend) or ())
+    device.ctrl_transfer(VENDOR_OUT, number, value, 0, data, _REQUEST_MS)

@@ -19,7 +19,7 @@ import usb.core
 
 from dtsa_agent.core.errors import ConfigError
 
-from .crazyradio_packets import FIRST_FIRMWARE, GET_SNIFFER_DROP_COUNT, SET_RADIO_MODE, SNIFFER, VENDOR_IN, VENDOR_OUT
+from .crazyradio_port import FIRST_FIRMWARE, GET_SNIFFER_DROP_COUNT, SET_RADIO_MODE, SNIFFER, VENDOR_IN, VENDOR_OUT
 
 LIST, CLAIM, REQUEST, PACKET, READ, DROPPED = range(6)
 VENDOR = 0x1915
@@ -52,11 +52,11 @@ class SimulatedDongle:
             connection = _connect(self._path)
             connection.send(bytes((CLAIM, self._number)))
             free = connection.recv(1) == b"\x01"
-        except OSError as error:
-            raise _error("the simulated radio has gone", errno.ENODEV) from error
+        except OSError:
+            raise self._disconnected() from None
         if not free:
             connection.close()
-            raise _error("the dongle is in use", errno.EBUSY)
+            raise usb.core.USBError("the dongle is in use", None, errno.EBUSY)
         self._socket = connection
 
     def dispose(self, device: Any = None) -> None:
@@ -89,22 +89,22 @@ class SimulatedDongle:
         if kind == VENDOR_OUT:
             if request == SET_RADIO_MODE:
                 if wValue > SNIFFER or self.bcdDevice < FIRST_FIRMWARE:
-                    raise _error("Pipe error", errno.EPIPE)
+                    raise usb.core.USBError("Pipe error", None, errno.EPIPE)
                 self._sniffs = wValue == SNIFFER
             self._send(struct.pack("<BBHH", REQUEST, request, wValue, wIndex) + bytes(data_or_wLength or ()))
             return 0
         if kind == VENDOR_IN and request == GET_SNIFFER_DROP_COUNT and self._sniffs:
             self._send(bytes((DROPPED,)))
             return array("B", self._await(DROPPED, timeout))
-        raise _error("not supported", errno.EPIPE)
+        raise usb.core.USBError("not supported", None, errno.EPIPE)
 
     def _send(self, message: bytes) -> None:
         self.managed_claim_interface(self, 0)
         assert self._socket is not None
         try:
             self._socket.send(message)
-        except OSError as error:
-            raise self._disconnected() from error
+        except OSError:
+            raise self._disconnected() from None
 
     def _receive(self, timeout_ms: int | None) -> bytes:
         data = b""
@@ -112,10 +112,10 @@ class SimulatedDongle:
             if self._socket is not None:
                 self._socket.settimeout(timeout_ms / 1000 if timeout_ms else None)
                 data = self._socket.recv(128)
-        except TimeoutError as error:
-            raise usb.core.USBTimeoutError("no answer", None, errno.ETIMEDOUT) from error
-        except OSError as error:
-            raise self._disconnected() from error
+        except TimeoutError:
+            raise usb.core.USBTimeoutError("no answer", None, errno.ETIMEDOUT) from None
+        except OSError:
+            data = b""
         if not data:
             raise self._disconnected()
         return data
@@ -132,11 +132,7 @@ class SimulatedDongle:
     def _disconnected(self) -> usb.core.USBError:
         self.dispose()
         time.sleep(GONE_S)
-        return _error("the simulated radio has gone", errno.ENODEV)
-
-
-def _error(text: str, number: int) -> usb.core.USBError:
-    return usb.core.USBError(text, None, number)
+        return usb.core.USBError("the simulated radio has gone", None, errno.ENODEV)
 
 
 def _connect(path: Path) -> socket.socket:

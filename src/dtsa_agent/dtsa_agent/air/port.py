@@ -23,6 +23,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
@@ -180,6 +181,8 @@ def settings_class(air: str) -> Any:
 def open_port(settings: PortSettings) -> Port:
     """Return the port of an agent, or of a listener; only its module is imported. ConfigError: it cannot be used."""
     air = settings.properties.name
+    if simulated := getattr(settings, "simulated_radio", ""):
+        import_module("dtsa_agent.air.crazyradio_simulated").replace_real_dongles(Path(simulated))
     port: Port = getattr(import_module(f"dtsa_agent.air.{air}_port"), f"{air.capitalize()}Port")(settings)
     return port
 

@@ -205,10 +205,7 @@ def rotate(q: tuple[float, float, float, float], v: Any) -> Any:
 
 
 def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
-    """Declare the rest of the parameters and fly an agent over a kind of port until a signal; return the exit code.
-
-    :raises ConfigError: for settings that are not usable.
-    """
+    """Declare the rest of the parameters and fly an agent over a kind of port until a signal; return the exit code."""
     config = SwarmConfig.from_dict(declare_settings(node, SwarmConfig, defaults=_DEFAULTS))
     own = AgentSettings(id=agent, **declare_settings(node, AgentSettings, skip=("id",)))
     cls = settings_class(air)

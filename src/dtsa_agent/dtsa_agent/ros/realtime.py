@@ -41,8 +41,8 @@ from dtsa_agent.ros.common.checks import SIZES, SLOT, BadMessage, check_start
 from dtsa_agent.ros.common.messages import Fields, header_of
 from dtsa_agent.stop import Stop
 
+from .agents_node import AgentsNode
 from .reporter import Reporter
-from .swarm_node import AgentsNode
 
 _NEVER = 1 << 62
 _LONGEST_LEAD_NS = 60_000_000_000  # from the start message to slot 0
@@ -243,7 +243,7 @@ class RealtimeNode(AgentsNode):
         in_time = stop.count == self._signals and self.slot <= self._leaves_by
         if in_time and any(agent.swarm.present[0] == PRESENT_LEAVING for agent in self.agents):
             return not self.loop.subscription.get_publisher_count()
-        self._reporter.publish(self.membership.run, self.slot)
+        self._reporter.publish(self.run_id, self.slot)
         for publisher in (self._air, self._telemetry):
             publisher.wait_for_all_acked(_DELIVERY)
         return True
@@ -274,14 +274,14 @@ class RealtimeNode(AgentsNode):
     def _may_join(self) -> bool:
         """Whether the channel has found all that this process publishes: what is published before is lost."""
         core.check_joinable(self.config.policy)
-        return self.membership.is_connected() and all(p.get_subscription_count() for p in (self._air, self._telemetry))
+        return all(p.get_subscription_count() for p in (self._processes, self._air, self._telemetry))
 
     def _begin(self, run: int, zero: int) -> None:
         """The run begins for these agents, with slot 0 at a time of CLOCK_MONOTONIC, ns."""
-        self.membership.begin(run)
+        session = self._begin_run(run)
         self._zero = zero
         if self._authenticator is not None and not self.config.auth_session:
-            self._authenticator.begin(self.membership.session)
+            self._authenticator.begin(session)
         keeps = (
             core.KEEPS_NUMBERS if self._called else core.KEEPS_NOTHING
         )  # the channel has said what time it is, or not
@@ -340,7 +340,7 @@ class RealtimeNode(AgentsNode):
         """Hand the frame of an agent over to the channel, before anything else is done."""
         if agent.frame:
             header, data = header_of(names.TIME_ZERO_NS + agent.start_ns), array("B", agent.frame)
-            self._air.publish(Frame(header=header, run=self.membership.run, slot=agent.slot, agent=agent.id, data=data))
+            self._air.publish(Frame(header=header, run=self.run_id, slot=agent.slot, agent=agent.id, data=data))
 
     def _fly_on(self, opened: Sequence[int]) -> None:
         """Report the slots that agents, by their places here, have opened, and fly their vehicles through them."""
@@ -357,7 +357,7 @@ class RealtimeNode(AgentsNode):
             self._fly(index)
         complete = min(agent.slot for agent in self.agents if agent.slot >= 0)
         if self._reporter.is_due(complete):
-            self._reporter.publish(self.membership.run, complete)
+            self._reporter.publish(self.run_id, complete)
 
     def _sense(self) -> None:
         """Write the state of vehicles that fly elsewhere."""

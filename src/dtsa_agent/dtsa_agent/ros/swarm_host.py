@@ -29,7 +29,8 @@ from dtsa_agent.ros.common.parameters import (
 )
 from dtsa_agent.stop import Stop
 
-from .swarm_node import AgentsNode, SwarmNode
+from .agents_node import AgentsNode
+from .swarm_node import SwarmNode
 
 _SHARED = Setting(
     "shared_table", "bool", False,
@@ -75,13 +76,12 @@ def host_agents(
     node: Node, ids: Sequence[int], config: SwarmConfig, stop: Stop, space: str, spaces: Sequence[str],
     shared: bool = False,
 ) -> None:  # fmt: skip
-    """Declare the rest of the parameters and run agents until the end.
+    """Declare the rest of the parameters and run agents until the end; ConfigError: settings are not usable.
 
     :param ids: of the agents that live here, ascending.
     :param space: namespace of what the whole swarm shares.
     :param spaces: namespace of each agent.
     :param shared: whether one table serves all.
-    :raises ConfigError: for settings that are not usable.
     """
     if shared and not can_share_table(config):
         raise ConfigError("shared_table", True, f"false with policy {config.policy}")
@@ -101,8 +101,7 @@ def host_agents(
         logger.error(f"ends after slot {agents.slot}: {error}")
         raise
     finally:
-        agents.membership.close()
-        agents.loop.close()
+        agents.close()
 
 
 def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, host: HostSettings) -> AgentsNode:
@@ -112,7 +111,7 @@ def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: s
         values = declare_list(node, name, [0], text)
         if len(values) not in (1, count):
             raise ConfigError(name, values, f"{count} whole numbers, or one for all")
-        return values * (count if len(values) == 1 else 1)
+        return values if len(values) == count else values * count
 
     count = len(ids)
     text = "offset of each agent's clock at the start, one for all or one an agent; positive: early (ns)"

@@ -17,7 +17,7 @@ from waiting import wait_for
 
 pytest.importorskip("usb")
 
-from dtsa_agent.air.crazyradio_packets import broadcast, datagram_in
+from dtsa_agent.air.crazyradio_port import broadcast, datagram_in
 from dtsa_agent.air.port import frame_in, link_of
 from dtsa_agent.air.settings import CrazyradioSettings
 from dtsa_agent.core import SwarmConfig
@@ -149,7 +149,7 @@ def test_a_dongle_that_goes_and_is_back_is_said_and_flies_on(tmp_path: Path) -> 
             wait_for(lambda: all(one.heard.total() > b + 10 for one, b in zip(flying, before, strict=True)))
             stack.close()
     assert {one.agent.summary()["times_unplugged"] for one in flying} == {1}
-    assert "crazyradio" not in {thread.name for thread in threading.enumerate()}
+    assert "dongle" not in {thread.name for thread in threading.enumerate()}
     merged = Merge([read(tmp_path / f"cf{agent}.mcap") for agent in (1, 2)]).summary()
     assert merged["decisions_again"]["differences"] == []
 

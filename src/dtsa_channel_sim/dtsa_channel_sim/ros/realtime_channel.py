@@ -109,7 +109,7 @@ class RealtimeChannel(RosChannel):
         air = (Frame, names.AIR_FRAME)
         super().__init__(node, channel, steps, names.REALTIME_WAITING, air, swarm_namespace=swarm_namespace, **more)
         qos = names.lockstep_qos(names.REALTIME_WAITING * self.agents)
-        self._reports = Feed(node, Report, f"{swarm_namespace}/{names.REPORT}", qos, raw=True)
+        self._reports = Feed(node, Report, f"{swarm_namespace}/{names.REPORT}", qos, read=bytes)
         self.accounts = Accounts(self.agents, steps, max(100, _KEEP_NS // self.slot_ns))
         self.air = LiveAir(channel)
         self.pace = Pace(self.slot_ns)

@@ -77,7 +77,7 @@ class RosChannel:
         self._clock_watched = False
         kind, topic = input
         qos = names.lockstep_qos(waiting * self.agents)
-        self.loop = Loop(node, kind, f"{swarm_namespace}/{topic}", qos, raw=True)
+        self.loop = Loop(node, kind, f"{swarm_namespace}/{topic}", qos, read=bytes)
         name = node.get_fully_qualified_name()
         settings = {"agents": self.agents, "slot_ms": self.slot_ns / 1e6, "steps": steps, "mode": self.mode}
         self.roster = Roster(self.agents, self.run_id, agreed or settings, name)
@@ -92,9 +92,7 @@ class RosChannel:
 
     def dropped(self) -> dict[str, int]:
         """Return the number of messages and frames that the channel and the agents have dropped, by reason."""
-        total = dict(self.intake.counts)
-        checks.add_counts(total, self.roster.dropped())
-        return total
+        return self.intake.counts + self.roster.dropped()
 
     def observe(self, *observers: ChannelObserver) -> None:
         """Add observers; they are called in this order, after those that are there already."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from typing import Any
@@ -49,7 +50,7 @@ class Roster:
         self._groups: dict[bytes, Member] = {}  # by the ids of all agents of a process, as messages carry them
         self._rivals: dict[int, tuple[Member, float]] = {}  # processes that claim agents of a member, since when
         self._left_over: dict[int, float] = {}  # processes of another run, since when
-        self._gone: dict[str, int] = {}  # what processes that have been replaced had dropped
+        self._gone: Counter[str] = Counter()  # what processes that have been replaced had dropped
         self.closed = False  # slot 0 begins: from now on no settings end the run
 
     @property
@@ -123,7 +124,7 @@ class Roster:
         """A process takes the place of those that had its agents."""
         for before in [self._of[agent] for agent in member.ids if agent in self._of]:
             if self._members.pop(before.process, None):
-                checks.add_counts(self._gone, before.dropped)
+                self._gone.update(before.dropped)
                 del self._groups[_key(before.ids)]
                 for other in before.ids:
                     self._of.pop(other, None)
@@ -174,11 +175,11 @@ class Roster:
         """Check that a frame can be from the process that has its sender."""
         _admit(self._of.get(agent), (agent,), sender)
 
-    def dropped(self) -> dict[str, int]:
+    def dropped(self) -> Counter[str]:
         """Return the number of messages that all processes have dropped, by reason."""
-        total = dict(self._gone)
+        total = self._gone.copy()
         for member in self._members.values():
-            checks.add_counts(total, member.dropped)
+            total.update(member.dropped)
         return total
 
 

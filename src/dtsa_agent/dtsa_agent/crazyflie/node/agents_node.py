@@ -114,7 +114,7 @@ class CrazyflieAgents(RealtimeNode):
         self._odometry_time = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
         self._stamp = np.zeros(count)  # s, system clock, of that
-        intake = self.membership.intake
+        intake = self.intake
         self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=intake)
         self._inputs = [Feed(node, Odometry, f"/{name}/{names.ODOMETRY}", LATEST, intake=intake) for name in vehicles]
         self._bridges = [PublisherGuard() for _ in vehicles]  # sources of odometry
@@ -125,7 +125,7 @@ class CrazyflieAgents(RealtimeNode):
         for index, feed in enumerate(self._inputs):
             message = feed.take()
             if message is not None:
-                with self.membership.intake.guard():
+                with self.intake.guard():
                     self._accept(index, message, feed)
         # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
         age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)

@@ -9,7 +9,7 @@ import json
 import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -78,12 +78,6 @@ class Intake:
             self.drop(error.reason, str(error))
 
 
-def add_counts(total: dict[str, int], more: Mapping[str, int]) -> None:
-    """Add counts by reason to a total."""
-    for reason, count in more.items():
-        total[reason] = total.get(reason, 0) + count
-
-
 class PublisherGuard:
     """Admits the messages of one publisher: of a given sender, or of the first one until it has been silent.
 
@@ -117,9 +111,10 @@ def check_slot(message: Any, agents: int) -> None:
         raise BadMessage(SIZES, f"slot message of phase {phase} with frames")
     if len(lengths) != count or received != count * ((agents + 7) // 8):
         raise BadMessage(SIZES, f"slot message: {count} senders, {len(lengths)} lengths, {received} bytes of receivers")
-    if phase == Slot.RUN:
-        check_frames(lengths, message.data)
+    if phase == Slot.RUN and not count and len(message.data):
+        raise BadMessage(SIZES, "slot message with frames of no agent")
     if count:
+        check_frames(lengths, message.data)
         if not all(lengths):
             raise BadMessage(SIZES, "slot message with an empty frame")
         check_ids(message.sender, agents, ascending=False)

@@ -39,7 +39,7 @@ _SERVING_S, _END_S = 0.5, 2.0
 
 
 class _NoExecutor(CallbackGroup):
-    """Keeps ordinary executors away from a subscription."""
+    """Keeps executors away from a subscription."""
 
     def can_execute(self, entity: Any) -> bool:
         return False
@@ -91,16 +91,14 @@ def _libraries() -> tuple[Any, Any] | None:
 class Feed:
     """A subscription whose messages are read by its owner, at its own time.
 
-    :param raw: messages are given as serialised bytes.
     :param intake: counts messages that cannot be read; None: they are errors.
     :param admits: says by a message and its sender whether it is received; None: all are.
-    :param read: makes messages of serialised bytes, in place of rclpy.
+    :param read: makes messages of serialised bytes, in place of rclpy; ``bytes``: they are given as they are.
     """
 
     def __init__(
-        self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, raw: bool = False,
-        intake: Intake | None = None, admits: Callable[[Any, bytes | None], bool] | None = None,
-        read: Callable[[bytes], Any] | None = None,
+        self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, intake: Intake | None = None,
+        admits: Callable[[Any, bytes | None], bool] | None = None, read: Callable[[bytes], Any] | None = None,
     ) -> None:  # fmt: skip
         self.sender: bytes | None = None  # participant of DDS, a process, that sent the last message; None: not known
         self.subscription = node.create_subscription(
@@ -108,7 +106,7 @@ class Feed:
         )
         self.handle = self.subscription.handle
         self._type, self._intake, self._admits = msg_type, intake, admits
-        self._read = read or (bytes if raw else partial(deserialize_message, message_type=msg_type))
+        self._read = read or partial(deserialize_message, message_type=msg_type)
         self._stack = ExitStack()
         self._stack.enter_context(self.handle)
         self._libraries = _libraries()

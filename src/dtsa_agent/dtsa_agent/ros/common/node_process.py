@@ -74,19 +74,13 @@ def follow_supervisor() -> bool:
 
 def node_options(supervised: bool) -> dict[str, Any]:
     """Return arguments for ``Node``: a supervised node goes without services that nothing asks, and starts faster."""
-    if not supervised:
-        return {}
     silent = Parameter("start_type_description_service", value=False)
-    return {"start_parameter_services": False, "enable_rosout": False, "parameter_overrides": [silent]}
+    without = {"start_parameter_services": False, "enable_rosout": False, "parameter_overrides": [silent]}
+    return without if supervised else {}
 
 
 def init_ros(args: list[str] | None, context: Context | None = None, domain_id: int | None = None) -> None:
-    """``rclpy.init`` without signal handlers of its own, and with a middleware that lets nodes be destroyed.
-
-    :param args: command line; None: ``sys.argv``.
-    :param context: what is initialized; None: the process's own.
-    :param domain_id: ROS domain; None: the environment's.
-    """
+    """``rclpy.init`` without signal handlers of its own, and with a middleware that lets nodes be destroyed."""
     log_where_possible(os.environ)
     rclpy.init(args=args, context=context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
     mend(_MIDDLEWARE)
@@ -118,11 +112,8 @@ def ending(node: Node) -> Iterator[None]:
 def run_node(name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None = None) -> int:
     """Run a node until it ends by itself or by SIGINT or SIGTERM; return its exit code.
 
-    0: a clean end (by a signal, too); 2: settings that are not usable; 1: other errors.
-
-    :param name: its own, for error messages.
-    :param body: creates the node and runs it; gets the signal flag and whether a supervisor started this process.
-    :param args: command line, default ``sys.argv``.
+    0: a clean end (by a signal, too); 2: settings that are not usable; 1: other errors. ``body`` creates the node and
+    runs it; it gets the signal flag and whether a supervisor started this process.
     """
     supervised = follow_supervisor()
     limit_to_machine(os.environ)

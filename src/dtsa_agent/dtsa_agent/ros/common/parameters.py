@@ -93,9 +93,8 @@ def _declare(node: Node, name: str, default: Any, info: ParameterDescriptor, all
 def check_parameters(node: Node) -> None:
     """Check that the node has all parameters that it was given; called when it has declared them.
 
-    One in a file may be meant for other nodes: it is only warned of, as is a file with nothing for this node.
-
-    :raises ConfigError: for one on the command line that it does not have.
+    ConfigError: one on the command line is none of its. One in a file may be meant for other nodes: it is only warned
+    of, as is a file with nothing for this node.
     """
     given, logger = node._parameter_overrides, node.get_logger()
     known = list(node.get_parameters_by_prefix(""))
@@ -176,7 +175,7 @@ def declare_swarm_namespace(node: Node) -> str:
 def swarm_wide_node(name: str, options: Mapping[str, Any] | None = None) -> tuple[Node, str]:
     """Return a node that belongs to a whole swarm, made with further options for ``Node``, and the swarm's namespace.
 
-    :raises ConfigError: if the parameter ``swarm_namespace`` is no namespace.
+    ConfigError: the parameter ``swarm_namespace`` is no namespace.
     """
     node = Node(name, namespace=names.SWARM, **(options or {}))
     try:
