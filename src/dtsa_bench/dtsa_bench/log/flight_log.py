@@ -61,7 +61,9 @@ class FlightLog(FlightArrays):
 
     # -- tables, made when first asked for; pandas frames; ConfigError: pandas is missing ----------------------------
     slots = _Table("A row a slot: slot, time_s (start), outcome, senders (count), sender (the first id, 0: nobody).")
-    frames = _Table("A row a frame: slot, time_s, sender, received, lost, collided (receivers), length, data and so on.")
+    frames = _Table(
+        "A row a frame: slot, time_s, sender, received, lost, collided (receivers), length, data and so on."
+    )
     receptions = _Table("A row a frame and other agent: slot, time_s, sender, receiver, received (or not).")
     decisions = _Table("A row an agent and slot: slot, time_s, agent, chosen (id, 0: nobody), reason, score, digest.")
     states = _Table("A row an agent and instant: time_s, agent, position_{x,y,z}_m, velocity_{x,y,z}_mps, frame map.")
