@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from dtsa_bench.flights.statistics import TimingStatistics
 from dtsa_bench.log.verify.on_air import FramesOnAir
+from dtsa_bench.log.verify.result import Mismatch
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
 MS = 1_000_000
@@ -59,6 +61,28 @@ def test_one_wrong_receiver_never_passes(frames: list[tuple[int, int, int]], fra
     _, sent = resolved(ChannelConfig(agents=5), frames)
     sent.received[frame % len(frames), receiver] ^= True
     assert not equal_again(sent)
+
+
+@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9))
+@settings(max_examples=60, deadline=None)
+def test_the_channels_own_verdicts_never_overlap(frames: list[tuple[int, int, int]], loss: float, seed: int) -> None:
+    _, sent = resolved(ChannelConfig(agents=5, loss=loss, seed=seed), frames)
+    sent.check_overlaps()
+
+
+def test_two_frames_at_one_time_are_never_both_heard() -> None:
+    config, deaf = ChannelConfig(agents=3), [False] * 3
+    with pytest.raises(Mismatch, match="together with a frame of cf2"):
+        sent_frames(config, [(1, 0, 24, [False, True, False], 0, 0), (2, 0, 24, deaf, 0, 0)]).check_overlaps()
+    length_ns = config.airtime.total_ns(24)
+    for gap_ns, second, passes in (
+        (length_ns // 2, True, False),
+        (length_ns, True, True),
+        (length_ns // 2, False, True),
+    ):
+        heard = [(1, 0, 24, [False, False, True], 0, 0), (2, gap_ns, 24, [False, False, second], 0, 0)]
+        with nullcontext() if passes else pytest.raises(Mismatch, match="together with a frame of cf1"):
+            sent_frames(config, heard).check_overlaps()
 
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:

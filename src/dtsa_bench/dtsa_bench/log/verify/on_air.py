@@ -84,6 +84,27 @@ class FramesOnAir:
                 collided[k], count = verdict.collided or 0, count + k.stop - k.start
         return received, lost, collided, count
 
+    def check_overlaps(self) -> None:
+        """Whether agents received no two frames at one time, and none while they sent. Not for radios behind lines.
+
+        Where verdicts cannot be made again, because they depend on places that are not recorded.
+
+        :raises Mismatch: at the first frame for which that is not so.
+        """
+        on_air_ns = np.array([self.config.airtime.on_air_ns(length) for length in self.length.tolist()], np.int64)
+        for agent in range(1, self.config.agents + 1):
+            own = self.sender == agent  # it is deaf from the order to send on
+            begin_ns = np.where(own, self.asked_ns, self.end_ns - on_air_ns)
+            frames = np.flatnonzero(own | self.received[:, agent - 1])
+            frames = frames[np.argsort(begin_ns[frames], kind="stable")]
+            before, after = frames[:-1], frames[1:]
+            overlap = (begin_ns[after] < self.end_ns[before]) & ~(own[before] & own[after])
+            for one, other in zip(before[overlap][:1].tolist(), after[overlap][:1].tolist(), strict=True):
+                heard = one if own[other] else other
+                why = f"it was on the air together with a frame of cf{self.sender[one + other - heard]}"
+                at = int(self.slot[heard]), int(self.sender[heard])
+                raise Mismatch("received", f"without cf{agent}", f"cf{agent}", why, *at)
+
     def check_received(self, heard: ReceivedFrames, slots: int) -> tuple[int, dict[str, Any]]:
         """Whether agents took in what was delivered to them, once, and not before it was.
 
