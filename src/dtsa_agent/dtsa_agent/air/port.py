@@ -120,11 +120,19 @@ class Port(ABC):
 
     @abstractmethod
     def send(self, data: bytes) -> str:
-        """Send a datagram at once; return why the port has refused it, or an empty text."""
+        """Send a datagram at once.
+
+        :param data: the datagram, at most `properties.longest` bytes.
+        :returns: why the port has refused it, or an empty text.
+        """
 
     @abstractmethod
     def receive(self, most: int) -> list[ReceivedDatagram]:
-        """Return what has arrived, at most so many datagrams, in this order; empty if nothing has."""
+        """Return what has arrived, in this order; empty if nothing has.
+
+        :param most: datagrams that are returned at most.
+        :returns: each with its time of arrival, ns, CLOCK_MONOTONIC.
+        """
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
@@ -135,7 +143,12 @@ class Port(ABC):
         """Free it for others."""
 
     def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
-        """Hand what others have sent to a station; return how many datagrams have arrived, at most so many."""
+        """Hand what others have sent to a station.
+
+        :param clock: the agent's own, on which the station lives.
+        :param most: datagrams that are handed over at most.
+        :returns: how many have arrived.
+        """
         datagrams = self.receive(most)
         for datagram in datagrams:
             if not datagram.own:

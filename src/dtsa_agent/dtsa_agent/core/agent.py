@@ -114,14 +114,20 @@ class Agent:
         self.group = AgentGroup(self.swarm)
 
     def on_slot(self, slot: int) -> bytes | None:
-        """Begin a slot, after closing an open one; returns the frame to send in it, or None."""
+        """Begin a slot, after closing an open one.
+
+        :param slot: its number, larger than that of the slot before.
+        :returns: the frame to send in it; None: the agent is silent.
+        """
         if self.group.slot >= 0:
             self.on_slot_end()
         return self.swarm.frame(0) if self.group.on_slot(slot) else None
 
     def on_frame(self, data: bytes, slot: int) -> bool:
-        """Receive a frame in a slot; malformed ones are counted in ``swarm.malformed`` and ignored.
+        """Receive a frame; malformed ones are counted in ``swarm.malformed`` and ignored.
 
+        :param data: the frame, whatever it is.
+        :param slot: number of the slot in which it arrived.
         :returns: whether it was accepted: a frame of this swarm and this slot time.
         """
         return self.swarm.hear(slot, data)

@@ -25,7 +25,11 @@ SENT, COLLIDED = "#e69f00", "#dc183c"
 
 
 def agent_colour(agent: int) -> str:
-    """The colour of an agent, ``#rrggbb``, by its id, from 1."""
+    """The colour of an agent.
+
+    :param agent: id, from 1.
+    :returns: ``#rrggbb``.
+    """
     return AGENT_COLOURS[(agent - 1) % len(AGENT_COLOURS)]
 
 

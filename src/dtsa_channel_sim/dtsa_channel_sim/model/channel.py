@@ -71,7 +71,10 @@ class Channel:
         return change
 
     def advance(self, slot: int) -> None:
-        """Note that a slot has been dealt with (on an ``Air``): later changes of settings begin after it."""
+        """Note that a slot has been dealt with (on an ``Air``): later changes of settings begin after it.
+
+        :param slot: its number.
+        """
         self._last = max(self._last, slot)
 
     def arbitrate(
@@ -102,7 +105,10 @@ class Channel:
         return self._arbitrate_many(slot, senders, lengths, positions)
 
     def medium(self, slot: int) -> Medium:
-        """Return the medium of a slot, with the settings that hold in it."""
+        """Return the medium of a slot, with the settings that hold in it.
+
+        :param slot: its number, 0 and more.
+        """
         if not self._first <= slot < self._end:
             self._use(slot)
         return self._medium

@@ -132,8 +132,9 @@ class ChannelConfig(Settings):
 
     @classmethod
     def from_dict(cls: type[Config], settings: Mapping[str, Any]) -> Config:
-        """Return the settings, validated. ``slot_ms`` may stand for ``slot_ns``.
+        """Return the settings, validated.
 
+        :param settings: values by name; ``slot_ms`` may stand for ``slot_ns``.
         :raises ConfigError: when a name is unknown or a value is not allowed.
         """
         values = dict(settings)
@@ -162,6 +163,7 @@ class ChannelConfig(Settings):
     def changed(self, values: Mapping[str, Any]) -> ChannelConfig:
         """Return these settings with some changeable ones changed, without the schedule.
 
+        :param values: new values by name.
         :raises ConfigError: when a setting cannot change in flight or its value is not allowed.
         """
         if not (values or self.schedule):

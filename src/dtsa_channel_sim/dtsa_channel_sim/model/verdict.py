@@ -28,7 +28,11 @@ class Verdict(NamedTuple):
 
     @classmethod
     def of(cls, senders: Sequence[int], receptions: Sequence[Any]) -> Verdict:
-        """Return the verdict on frames, by what became of each of them (``received``, ``lost``, ``collided``)."""
+        """Return the verdict on the frames of a slot.
+
+        :param senders: ids of the agents that sent, one a frame.
+        :param receptions: what became of each frame: ``received`` (N,), ``lost`` and ``collided`` receivers.
+        """
         if not senders:
             return cls(IDLE, (), None, None, None)
         lost = tuple(reception.lost for reception in receptions)
@@ -37,7 +41,10 @@ class Verdict(NamedTuple):
         return cls(COLLISION if any(collided) else SUCCESS, tuple(senders), received, lost, collided)
 
     def mask(self, agents: int) -> NDArray[np.bool_]:
-        """Return ``received`` written out, (F, N), also where it is None."""
+        """Return ``received`` written out, (F, N), also where it is None.
+
+        :param agents: N, their number.
+        """
         if self.received is not None:
             return self.received
         mask = np.ones((len(self.senders), agents), dtype=np.bool_)

@@ -90,6 +90,7 @@ class Table:
     def observation(self, slot: int) -> NDArray[np.float32]:
         """What the agent has heard before a slot and its own state, as numbers for learning (docs/how-to/learning.md).
 
+        :param slot: number of the slot that begins.
         :returns: (10 + 9 N,), with the units of ``dtsa.env.fields``.
         :raises ValueError: for the table of an agent that is elsewhere.
         """

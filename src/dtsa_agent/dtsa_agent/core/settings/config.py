@@ -177,7 +177,11 @@ class SwarmConfig(Settings):
         return LENGTHS[self.profile] + self.own_bytes + (TAG_LENGTH if self.auth else 0)
 
     def protocol_part(self, data: bytes, sealed: bool = False) -> bytes:
-        """A frame without what plug-ins, and where it is sealed authentication, append to it."""
+        """A frame without what plug-ins, and where it is sealed authentication, append to it.
+
+        :param data: the frame.
+        :param sealed: whether it ends with a tag, if the swarm has authentication.
+        """
         return data[: max(0, len(data) - self.own_bytes - (TAG_LENGTH if sealed and self.auth else 0))]
 
     @property

@@ -84,12 +84,17 @@ class Result:
         return self.difference is None
 
     def count(self, what: str, times: int = 1) -> None:
-        """Note checks that passed."""
+        """Note checks that passed.
+
+        :param what: what was checked, as the result names it.
+        :param times: how often.
+        """
         self.checked[what] = self.checked.get(what, 0) + times
 
     def note_rules(self, rules: RuleChecker) -> None:
         """Note whether the frames kept to the policy's rules.
 
+        :param rules: the rules, after all frames.
         :raises Mismatch: at the first rules that were broken.
         """
         if not rules.has_rules:
