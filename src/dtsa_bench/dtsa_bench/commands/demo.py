@@ -28,7 +28,7 @@ _REMOTE = ("SSH_CONNECTION", "SSH_CLIENT", "SSH_TTY", "CI")
 
 class DemoCommand(Command):
     description = """\
-Nine flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a channel that quadcopters
+Nine flights of ROS 2 nodes, recorded and verified, tell in four steps who sends next on a channel that quadcopters
 share, and what goes wrong when messages are lost. One picture shows them all. The first eight, which are the same on
 every machine, stand side by side on a page; in the last one, in real time, a process is killed and comes back."""
     examples = (

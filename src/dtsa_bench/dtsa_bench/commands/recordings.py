@@ -147,8 +147,8 @@ prints."""
 
 class MergeCommand(Command):
     description = """\
-Lays the bags that agents on a network have made of their own flights on one time line, by the frames that they share,
-and says what came of the flight: clocks, ages, errors, agreement, the closest pair; whether two spoke in one turn;
+Joins the bags that agents on a network have made of their own flights on one time line, by the frames that they share,
+and says what came of the flight: clocks, ages, errors, agreement, the closest pair; whether two sent in one turn;
 whether all decisions follow from what each agent heard, made again by the core. Exit code 1 if they do not, if the
 agents did not hear each other, or if frames do not go both ways between groups of them: offsets of clocks are not
 determined then. --out keeps the whole flight as one bag, which report, export, verify, replay and ros2

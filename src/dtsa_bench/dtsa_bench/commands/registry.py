@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 _COMMANDS = {  # by name: the module, and what it does
-    "demo": ("demo", "who speaks next, in nine recorded flights, a page and a picture; under a minute"),
+    "demo": ("demo", "who sends next, in nine recorded flights, a page and a picture; under a minute"),
     "fly": ("fly", "one flight with real ROS 2 nodes, recorded to a bag"),
     "agent": ("network", "one agent on a real network: frames over UDP, no channel node, no ROS"),
     "simulate": ("simulation", "one or many flights without ROS, as fast as the machine allows"),

@@ -35,7 +35,7 @@ NAMES = np.array(
 
 
 class CdrBuilder:
-    """Lays one message out as CDR; alignment counts from the end of the 4-byte header."""
+    """Writes one message as CDR; alignment counts from the end of the 4-byte header."""
 
     def __init__(self) -> None:
         self.data = bytearray()
