@@ -1,4 +1,1 @@
-"""Pages for a browser: reports of runs and sweeps, the live view, and the demo.
-
-It imports `flights`, `experiments`, `log` and what lies below.
-"""
+"""Pages for a browser: reports of runs and sweeps, the live view, and the demo."""

@@ -1,4 +1,1 @@
-"""The demo: nine recorded flights that show, in four steps, what this software is about.
-
-`flights` flies and reads them, `picture` draws them.
-"""
+"""The demo: `flights` flies and reads nine recorded flights, `picture` draws them."""

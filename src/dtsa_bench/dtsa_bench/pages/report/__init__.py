@@ -1,4 +1,1 @@
-"""The report: one self-contained HTML page of one recorded run, or of several side by side.
-
-`data` computes what the page shows, and writes it. `tables` writes the pages of sweeps and leagues.
-"""
+"""The report of runs: `data` computes what the page shows, and writes it; `tables`: pages of sweeps and leagues."""

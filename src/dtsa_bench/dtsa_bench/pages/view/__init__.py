@@ -1,1 +1,1 @@
-"""A swarm in a browser while it flies, and recorded flights played: sources, a server on this machine, its page."""
+"""A swarm in a browser while it flies: sources, a server on this machine, its page."""
