@@ -1,4 +1,4 @@
-"""Flights in real time, agents on their own clocks."""
+"""Integration: flights in real time, agents on their own clocks."""
 
 from __future__ import annotations
 

@@ -148,11 +148,15 @@ RADIOS: dict[str, RadioRow] = {
 }
 
 
-@lru_cache(maxsize=64)  # each flight asks several times
 def airtime_of(radio: str, bitrate: int, ramp_up_ns: int, link_delay_ns: int) -> Airtime:
     """Return the times of a radio, by its name, under settings as :class:`ChannelConfig` has them."""
     row = RADIOS[radio]
     if not row.tuned:
         return row.airtime
     line = Line(link_delay_ns, 0, link_delay_ns, 0) if radio == "plain" else row.airtime.line
-    return replace(row.airtime, bitrate=bitrate, ramp_up_ns=ramp_up_ns, line=line)
+    return _tuned(row.airtime, bitrate, ramp_up_ns, line)
+
+
+@lru_cache(maxsize=64)  # each flight asks several times
+def _tuned(airtime: Airtime, bitrate: int, ramp_up_ns: int, line: Line) -> Airtime:
+    return replace(airtime, bitrate=bitrate, ramp_up_ns=ramp_up_ns, line=line)
