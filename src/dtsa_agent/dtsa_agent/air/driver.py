@@ -18,7 +18,7 @@ import numpy as np
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, Station, StationSettings, check_joinable
+from dtsa_agent.core.station import HoverReason, Station, StationSettings, check_joinable
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.priority import realtime_thread, wake_precisely
@@ -163,14 +163,14 @@ class LiveAgent:
         counts, hovers = self.counts, self.station.hovers
         self.slot = slot
         self._vehicle.fly(self.swarm, slot)
-        if hovers == FLIES:
+        if hovers == HoverReason.NONE:
             counts.flew = True
-        elif hovers == NO_QUORUM:
+        elif hovers == HoverReason.NO_QUORUM:
             counts.hovered[counts.flew] += 1
         if now >= self._status_due_ns:
             self._status_due_ns = now + _STATUS_NS
             status = self.station.status
-            if hovers != IS_NEW:
+            if hovers != HoverReason.IS_NEW:
                 counts.add_contacts(status.others, status.hears)
             self._reports.status(status, now)
 

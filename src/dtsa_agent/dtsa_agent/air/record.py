@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from dtsa_agent.core.delays import Delays
-from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, OTHER_SETTINGS, REJECTED, SAME_ID, STATES
+from dtsa_agent.core.station import OTHER_SETTINGS, REJECTED, STATES, HoverReason
 from dtsa_agent.core.swarm import Floats
 
 _SECOND = 1_000_000_000
@@ -191,10 +191,12 @@ class Reports:
         """Report the state in a ``dtsa_station_status`` with slots."""
         contact = f"hears {status.hears} of {status.others}, is heard by {status.heard_by} (quorum {status.needed})"
         text = {
-            FLIES: f"flies: {contact}", SAME_ID: f"hovers: another agent sends as {self._id}",
-            NO_QUORUM: f"hovers: {contact}", IS_NEW: f"is new, and hovers until the others know it: {contact}",
-        }[status.hovers]  # fmt: skip
-        if status.hovers != FLIES and STATES[status.state] == "alone":
+            HoverReason.NONE: f"flies: {contact}",
+            HoverReason.SAME_ID: f"hovers: another agent sends as {self._id}",
+            HoverReason.NO_QUORUM: f"hovers: {contact}",
+            HoverReason.IS_NEW: f"is new, and hovers until the others know it: {contact}",
+        }[status.hovers]
+        if status.hovers != HoverReason.NONE and STATES[status.state] == "alone":
             text = "is alone, and hovers until it hears others"
         self.state(text, now_ns)
         if self._show is not None and now_ns >= self._show_due_ns:

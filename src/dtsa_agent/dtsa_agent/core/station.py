@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any, NamedTuple, Protocol
 
 from .authentication import Authenticator
@@ -17,7 +18,7 @@ from .frame import TAG_LENGTH, position_step
 from .kernel import ffi, fields_of, lib
 from .registry import POLICIES
 from .settings.config import SwarmConfig
-from .swarm import PRESENT_LEAVING, Swarm
+from .swarm import Presence, Swarm
 
 #: What became of a datagram, in the order of ``dtsa_verdict``; empty: it was accepted.
 VERDICTS = (
@@ -26,12 +27,28 @@ VERDICTS = (
 )  # fmt: skip
 _, _, LENGTH, OTHER_SETTINGS, NO_FRAME, _, REJECTED, REPEATED, OTHER_TIME, _, TOO_EARLY = VERDICTS
 STATES = ("listening", "alone", "joined")
-FLIES, LISTENS, IS_NEW, SAME_ID, NO_QUORUM = range(5)  # why an agent hovers
 ALL_BUT_ONE = "all-but-one"
 QUORUMS = f"{ALL_BUT_ONE}, a share of the others (80%), or a number of them (0: it never hovers for this)"
-KEEPS_NOTHING, KEEPS_NUMBERS, KEEPS_STARTS = range(3)  # slots move as the rules say; with frames that fit; never
 BETWEEN = lib.DTSA_BETWEEN / 1000  # of a slot, between a frame that left late and the next slot
 EARLY_COUNT = 64  # frames of slots still to come that are kept
+
+
+class HoverReason(IntEnum):
+    """Why an agent hovers, as in ``dtsa_station.h``."""
+
+    NONE = 0  # it flies
+    LISTENS = 1  # it has no slots yet
+    IS_NEW = 2  # the others may not know it yet
+    SAME_ID = 3  # another agent sends as this one
+    NO_QUORUM = 4  # too few of the others hear it, or are heard
+
+
+class KeepsTime(IntEnum):
+    """What stays as it is, whatever an agent hears."""
+
+    NOTHING = 0  # slots move as the rules say
+    NUMBERS = 1  # of slots, which move with frames that fit
+    STARTS = 2  # of slots, and their numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +137,8 @@ class StationSettings:
 
     def __init__(
         self, config: SwarmConfig, link: Link, authenticator: Authenticator | None = None, id: int = 1,
-        quorum: str = "0", origin_ns: int | None = None, listens: bool = False, keeps_time: int = KEEPS_NOTHING,
+        quorum: str = "0", origin_ns: int | None = None, listens: bool = False,
+        keeps_time: KeepsTime = KeepsTime.NOTHING,
     ) -> None:  # fmt: skip
         key, session = (b"", 0) if authenticator is None else authenticator.key_and_session
         row, (number, share) = config.policy_row, parse_quorum(quorum)
@@ -275,7 +293,7 @@ class Station:
 
     @property
     def hovers(self) -> int:
-        """Why the agent hovers in the present slot; ``FLIES``: it does not."""
+        """Why the agent hovers in the present slot; ``HoverReason.NONE``: it does not."""
         return int(lib.dtsa_station_hovers(self.c))
 
     def raise_fault(self) -> None:
@@ -305,7 +323,7 @@ class Station:
 
     def leave_air(self) -> bool:
         self.swarm.leave(0)
-        return bool(self.swarm.present[0] == PRESENT_LEAVING)
+        return bool(self.swarm.present[0] == Presence.LEAVING)
 
     def probation(self) -> bool:
         return self.swarm.config.policy_row.probation and bool(self.swarm.lease_status(0)["probation"])

@@ -24,7 +24,6 @@ Slots = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 Hashes = NDArray[np.uint32]
 
-PRESENT_LEAVING = lib.PRESENT_LEAVING  # in ``present``: will be switched off after a last frame
 DECAY_STEPS = 4096  # beyond this many control periods a vehicle has settled at its command (estimator intent)
 
 
@@ -35,6 +34,14 @@ def _decay(tau: float, step_s: float) -> Floats:
     lib.dtsa_decay(tau, step_s, DECAY_STEPS, memory(decay, writable=True))
     decay.setflags(write=False)
     return decay
+
+
+class Presence(IntEnum):
+    """Whether an agent takes part."""
+
+    ABSENT = 0
+    PRESENT = 1
+    LEAVING = lib.PRESENT_LEAVING  # it will be switched off after a last frame
 
 
 class SlotOutcome(IntEnum):
@@ -313,7 +320,7 @@ class Swarm:
     def leave(self, local_index: int) -> None:
         """A local agent leaves: with a policy that says so, after its next own turn; with others at once."""
         if self.present[local_index]:
-            self.present[local_index] = PRESENT_LEAVING if self.config.policy_row.says_leaving else 0
+            self.present[local_index] = Presence.LEAVING if self.config.policy_row.says_leaving else 0
 
     def with_own_tables(self, slot: int) -> Swarm:
         """The same agents in the same state, each with a table of its own: for the first frame that not all have heard.

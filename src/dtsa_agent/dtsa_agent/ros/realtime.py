@@ -33,7 +33,7 @@ from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator
 from dtsa_agent.core.station import Link, Station, StationSettings
-from dtsa_agent.core.swarm import PRESENT_LEAVING
+from dtsa_agent.core.swarm import Presence
 from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import split_frames, unpack_received
@@ -241,7 +241,7 @@ class RealtimeNode(AgentsNode):
                 if agent.slot >= 0:
                     agent.station.leave()
         in_time = stop.count == self._signals and self.slot <= self._leaves_by
-        if in_time and any(agent.swarm.present[0] == PRESENT_LEAVING for agent in self.agents):
+        if in_time and any(agent.swarm.present[0] == Presence.LEAVING for agent in self.agents):
             return not self.loop.subscription.get_publisher_count()
         self._reporter.publish(self.run_id, self.slot)
         for publisher in (self._air, self._telemetry):
@@ -282,14 +282,13 @@ class RealtimeNode(AgentsNode):
         self._zero = zero
         if self._authenticator is not None and not self.config.auth_session:
             self._authenticator.begin(session)
-        keeps = (
-            core.KEEPS_NUMBERS if self._called else core.KEEPS_NOTHING
-        )  # the channel has said what time it is, or not
+        # The channel has said what time it is, or not.
+        keeps = core.KeepsTime.NUMBERS if self._called else core.KeepsTime.NOTHING
         link = Link(b"", says_late=False, names=0, flight_ns=self._flight_ns, trust_ns=_TRUST_NS)
         for agent in self.agents:
             settings = StationSettings(
                 self.config, link, self._authenticator, agent.id, origin_ns=0, listens=not self._called,
-                keeps_time=keeps if self._align else core.KEEPS_STARTS,
+                keeps_time=keeps if self._align else core.KeepsTime.STARTS,
             )  # fmt: skip
             agent.begin(settings, zero)
         for agent, place in zip(self.agents, self._resume_at if not self._called else (), strict=False):

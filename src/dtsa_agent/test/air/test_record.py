@@ -12,7 +12,7 @@ from dtsa_agent.air.port import link_of
 from dtsa_agent.air.record import Reports
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
-from dtsa_agent.core.station import ALL_BUT_ONE, FLIES, IS_NEW, NO_QUORUM, STATES, Station, StationSettings
+from dtsa_agent.core.station import ALL_BUT_ONE, STATES, HoverReason, Station, StationSettings
 
 SECOND = 10**9
 
@@ -58,21 +58,21 @@ def status(hovers: int, hears: int, heard_by: int, state: int = 2) -> SimpleName
 def test_a_state_that_lasts_is_printed_once() -> None:
     lines: list[str] = []
     reports = Reports(1, 10.0, lines.append, 0)
-    reports.status(status(IS_NEW, 2, 1), SECOND // 2)
-    reports.status(status(FLIES, 5, 5), SECOND)
+    reports.status(status(HoverReason.IS_NEW, 2, 1), SECOND // 2)
+    reports.status(status(HoverReason.NONE, 5, 5), SECOND)
     assert lines == []  # a start takes a moment
     for tenth in range(20, 100):
-        reports.status(status(FLIES, 5, 5), tenth * SECOND // 10)
+        reports.status(status(HoverReason.NONE, 5, 5), tenth * SECOND // 10)
     assert lines == ["flies: hears 5 of 5, is heard by 5 (quorum 4)"]
-    reports.status(status(NO_QUORUM, 2, 1), 50 * SECOND)
+    reports.status(status(HoverReason.NO_QUORUM, 2, 1), 50 * SECOND)
     assert len(lines) == 1  # it may be over at once
-    reports.status(status(NO_QUORUM, 2, 1), 51 * SECOND)
-    reports.status(status(NO_QUORUM, 3, 1), 60 * SECOND)
+    reports.status(status(HoverReason.NO_QUORUM, 2, 1), 51 * SECOND)
+    reports.status(status(HoverReason.NO_QUORUM, 3, 1), 60 * SECOND)
     assert lines[1:] == ["hovers: hears 2 of 5, is heard by 1 (quorum 4)"]
-    reports.status(status(FLIES, 5, 5), 61 * SECOND)
-    reports.status(status(FLIES, 4, 5), 63 * SECOND)
+    reports.status(status(HoverReason.NONE, 5, 5), 61 * SECOND)
+    reports.status(status(HoverReason.NONE, 4, 5), 63 * SECOND)
     assert lines[2:] == ["flies: hears 4 of 5, is heard by 5 (quorum 4)"]
-    reports.status(status(FLIES, 5, 5), 99 * SECOND)
+    reports.status(status(HoverReason.NONE, 5, 5), 99 * SECOND)
     assert len(lines) == 3
 
 
@@ -80,5 +80,5 @@ def test_an_agent_that_hears_nobody_says_that_it_is_alone() -> None:
     lines: list[str] = []
     reports = Reports(1, 10.0, lines.append, 0)
     for second in range(10):
-        reports.status(status(NO_QUORUM, 0, 0, STATES.index("alone")), second * SECOND)
+        reports.status(status(HoverReason.NO_QUORUM, 0, 0, STATES.index("alone")), second * SECOND)
     assert lines == ["is alone, and hovers until it hears others"]

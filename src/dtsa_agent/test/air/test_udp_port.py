@@ -25,7 +25,7 @@ from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, Frame, Swarm, SwarmConfig, encode_frame
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.station import BETWEEN, FLIES, Station, StationSettings
+from dtsa_agent.core.station import BETWEEN, HoverReason, Station, StationSettings
 from dtsa_agent.priority import realtime_thread
 from dtsa_agent.stop import Stop
 
@@ -192,7 +192,7 @@ def test_other_settings_and_another_key_are_said_in_flight() -> None:
     lines: list[str] = []
     second, now = 1_000_000_000, [0]
     reports = Reports(1, config.slot_ms, lines.append, 0)
-    flies = SimpleNamespace(hovers=FLIES, others=2, hears=2, heard_by=2, needed=1, state=2, timed=0, off=0)
+    flies = SimpleNamespace(hovers=HoverReason.NONE, others=2, hears=2, heard_by=2, needed=1, state=2, timed=0, off=0)
 
     def arrives(*data: bytes) -> list[str]:
         for one in data:

@@ -15,7 +15,7 @@ from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference import datagram
 from dtsa_agent.core.reference.table import Rules
-from dtsa_agent.core.station import FLIES, STATES, VERDICTS, Link, Named, Station, StationSettings
+from dtsa_agent.core.station import STATES, VERDICTS, HoverReason, Link, Named, Station, StationSettings
 
 MS = 1_000_000
 NETWORK = Link(b"DT\x01\x00abcd", True, 4, 100_000, MS)  # UDP, a modem, a Crazyradio, nothing but frames
@@ -253,7 +253,7 @@ def test_stations_need_a_clock_and_a_port_and_nothing_else(policy: str) -> None:
                 assert lib.dtsa_station_receive(agent.station, noise, len(noise), now_ns) != 0
     for agent in agents:
         status = agent.status
-        assert (STATES[status.state], status.hovers, status.in_step) == ("joined", FLIES, 3)
+        assert (STATES[status.state], status.hovers, status.in_step) == ("joined", HoverReason.NONE, 3)
         assert (status.hears, status.heard_by, status.both, status.needed, status.others) == (2, 2, 2, 1, 2)
         assert agent.is_intact()
     assert calls < 3 * 8_000 / 10 * 5  # a few a slot

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.station import KEEPS_NOTHING, KEEPS_NUMBERS, KEEPS_STARTS, STATES, Link, Station, StationSettings
+from dtsa_agent.core.station import STATES, KeepsTime, Link, Station, StationSettings
 
 MS = 1_000_000
 SLOT = 20 * MS
@@ -45,8 +45,8 @@ def hear_late(station: Station, late_ns: int) -> int:
 
 
 @pytest.mark.parametrize(("keeps", "late_ns", "least", "most"), [
-    (KEEPS_NUMBERS, MS // 2, MS // 4, MS // 2), (KEEPS_NUMBERS, 3 * MS, 0, 0), (KEEPS_STARTS, MS // 2, 0, 0),
-    (KEEPS_NOTHING, 3 * MS, 3 * MS, 3 * MS),
+    (KeepsTime.NUMBERS, MS // 2, MS // 4, MS // 2), (KeepsTime.NUMBERS, 3 * MS, 0, 0),
+    (KeepsTime.STARTS, MS // 2, 0, 0), (KeepsTime.NOTHING, 3 * MS, 3 * MS, 3 * MS),
 ])  # fmt: skip
 def test_one_that_was_told_the_time_moves_little_or_never(keeps: int, late_ns: int, least: int, most: int) -> None:
     assert least <= hear_late(station_of(origin_ns=0, listens=False, keeps_time=keeps), late_ns) <= most
@@ -54,7 +54,7 @@ def test_one_that_was_told_the_time_moves_little_or_never(keeps: int, late_ns: i
 
 @pytest.mark.parametrize("far_ns", [11 * MS, -9 * SLOT])
 def test_one_that_keeps_its_slots_accepts_frames_however_far_they_are_off(far_ns: int) -> None:
-    station = station_of(origin_ns=0, listens=False, keeps_time=KEEPS_NUMBERS)
+    station = station_of(origin_ns=0, listens=False, keeps_time=KeepsTime.NUMBERS)
     assert hear_late(station, far_ns) == 0
     assert station.status.heard > 40
     assert station.status.restarts == 0

@@ -14,7 +14,7 @@ import pytest
 from plain_stations import STARTED, compare_statements, rules_of
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.station import FLIES, SAME_ID
+from dtsa_agent.core.station import HoverReason
 from dtsa_bench.simulation import live
 from dtsa_bench.simulation.live import MS, LiveFault, LiveFlight, LiveResult, S, command_of, draw_flight, fly, shrink
 
@@ -58,7 +58,7 @@ class Watch:
 
     def flown_share(self, host: int, begin_s: float, end_s: float) -> float:
         samples = self.between(host, begin_s, end_s)
-        return sum(sample.hovers == FLIES for sample in samples) / len(samples)
+        return sum(sample.hovers == HoverReason.NONE for sample in samples) / len(samples)
 
 
 def fault(kind: str, at_s: float, lasts_s: float, agent: int = 0, group: int = 0, amount: float = 0.0) -> LiveFault:
@@ -141,13 +141,13 @@ def test_an_agent_that_restarts_and_that_nobody_hears_does_not_fly(names: int, p
 def test_of_two_processes_with_one_id_the_second_never_flies(at_s: float, policy: str) -> None:
     watch = Watch(LiveFlight(2, 5, policy, drift_ppm=20, faults=(fault("same-id", at_s, 30, 1),)))
     first, second = watch.between(1, at_s + 5, at_s + 30), watch.between(5, 5, 30)
-    assert FLIES not in {sample.hovers for sample in second}
-    assert {sample.hovers for sample in second} == {SAME_ID}
+    assert HoverReason.NONE not in {sample.hovers for sample in second}
+    assert {sample.hovers for sample in second} == {HoverReason.SAME_ID}
     if at_s > 1:  # the first one was there before: it flies on
-        assert {sample.hovers for sample in first} == {FLIES}
+        assert {sample.hovers for sample in first} == {HoverReason.NONE}
         assert second[0].sent == second[-1].sent
     else:
-        assert {sample.hovers for sample in first} in ({FLIES}, {SAME_ID})
+        assert {sample.hovers for sample in first} in ({HoverReason.NONE}, {HoverReason.SAME_ID})
 
 
 @both_policies
