@@ -13,7 +13,8 @@ from dtsa_bench.commands.registry import report_missing_package
 
 def dtsa() -> int:
     """``dtsa``, and ``python -m dtsa_bench``."""
-    from dtsa_bench.commands.cli import INTERRUPTED, main
+    from dtsa_bench.commands.cli import main
+    from dtsa_bench.commands.registry import INTERRUPTED
 
     code = main()
     if code == INTERRUPTED or "rclpy" in sys.modules:  # the middleware's own end may wait for locks of the dead

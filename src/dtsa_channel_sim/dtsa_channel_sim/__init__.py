@@ -3,9 +3,10 @@
 from dtsa_channel_sim.model.air import Air, FrameVerdict
 from dtsa_channel_sim.model.airtime import Airtime
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.config import CHANGEABLE, AgentClock, Change, ChannelConfig, ClockConfig, make_clocks
+from dtsa_channel_sim.model.config import CHANGEABLE, AgentClock, ChannelConfig, ClockConfig, make_clocks
 from dtsa_channel_sim.model.measured import MeasuredLosses
 from dtsa_channel_sim.model.medium import Medium, OnAir, Reception
+from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.topology import LinkLoss
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from rclpy.node import Node
 
+from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
@@ -105,7 +106,7 @@ def host_agents(
 
 
 def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, host: HostSettings) -> AgentsNode:
-    from .realtime import ClockMap, RealtimeNode
+    from .realtime import RealtimeNode
 
     def declare_numbers(name: str, count: int, text: str) -> list[int]:
         values = declare_list(node, name, [0], text)

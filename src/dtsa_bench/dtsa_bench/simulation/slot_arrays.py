@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Swarm
-from dtsa_agent.core.authentication import TAG_LENGTH
+from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.core.kernel import ffi, lib, memory, shared_arrays
 from dtsa_channel_sim import Verdict
 

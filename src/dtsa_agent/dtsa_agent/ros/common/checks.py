@@ -17,7 +17,7 @@ from dtsa_msgs.msg import Process, Slot
 from nav_msgs.msg import Odometry
 
 from dtsa_agent.core.errors import RemoteProtocolError
-from dtsa_agent.core.swarm import FRAME_MAX
+from dtsa_agent.core.frame import FRAME_MAX
 
 from . import names
 
