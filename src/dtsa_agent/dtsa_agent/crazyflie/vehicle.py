@@ -511,11 +511,8 @@ class CrazyflieVehicle:
                 self.land(reason)
                 self._landings = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
 
-    def tick(self, now: float, feed: bool) -> None:
-        """Called 50 times a second: goes on with a stream of its own, and sends again what has not been answered.
-
-        :param feed: send the emergency stop watchdog, and blind landings that are due.
-        """
+    def tick(self, now: float) -> None:
+        """Called 50 times a second: goes on with a stream of its own, and sends again what has not been answered."""
         with self.lock:
             self._paused &= self.tracker.age(now) > self.station.safety.position_age_s
             self._go_on(now)
@@ -523,16 +520,16 @@ class CrazyflieVehicle:
                 self.link.order_log(now)
             if self.state in WATCHED and self._order is not None and (order := self._order.due(now)) is not None:
                 self.link.order(order)
-            if feed:
-                self._feed_watchdog(now)
 
-    def _feed_watchdog(self, now: float) -> None:
-        if self._landings and now >= self._landings[0]:
-            self._landings.pop(0)
-            self._streaming = True  # it must end a stream that the firmware may still follow
-            self._descend(0.0, BLIND_LAND_S)
-        # From the first arming on: once it has begun, the firmware locks itself when it ends.
-        self.guarded |= self.station.safety.emergency_watchdog and self.state in WATCHED
-        self.link.guarded = self.guarded
-        if self.guarded and self.state not in (*OFF, State.EMERGENCY):
-            self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
+    def feed_watchdog(self, now: float) -> None:
+        """Called `WATCHDOG_HZ` times a second: sends the emergency stop watchdog, and a blind landing that is due."""
+        with self.lock:
+            if self._landings and now >= self._landings[0]:
+                self._landings.pop(0)
+                self._streaming = True  # it must end a stream that the firmware may still follow
+                self._descend(0.0, BLIND_LAND_S)
+            # From the first arming on: once it has begun, the firmware locks itself when it ends.
+            self.guarded |= self.station.safety.emergency_watchdog and self.state in WATCHED
+            self.link.guarded = self.guarded
+            if self.guarded and self.state not in (*OFF, State.EMERGENCY):
+                self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
