@@ -72,7 +72,7 @@ class CrazyflieVehicle:
         self.guarded = False  # the firmware's emergency watchdog is running
         self.last: VehicleState | None = None  # what it has reported last
         self.refused = 0  # streamed commands that did not count
-        self.longer = ""  # that the last landing takes longer than ordered, and why
+        self.longer = ""  # that the present landing takes longer than ordered, and why
         self._log, self._publish = log, on_state
         self._log_times: deque[float] = deque(maxlen=200)
         self._trusted_height = 0.0  # m, the last one before the estimate was wrong
@@ -109,6 +109,7 @@ class CrazyflieVehicle:
         level = "error" if state in (State.EMERGENCY, State.LOST) else "info"
         self._log(level, f"{self.name}: {before.name.lower()} -> {state.name.lower()} ({reason})")
         self.action = reason
+        self.longer = "" if before == State.LANDING else self.longer
         if before == State.LANDING and state == State.ARMED:
             self.link.order(lambda cf: cf.supervisor.send_arming_request(False))
 
