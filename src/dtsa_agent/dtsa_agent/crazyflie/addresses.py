@@ -14,13 +14,12 @@ import socket
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
-from urllib.parse import urlsplit
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
 BITRATES = {"250K": 250_000, "1M": 1_000_000, "2M": 2_000_000}
 ANY = "*"  # any dongle
-LAST_CHANNEL = 125
+LAST_CHANNEL, LAST_PORT = 125, 65535
 OVERHEAD_BITS = 73  # of a packet: preamble, address, control, checksum
 TURN_S = 130e-6  # until a radio sends
 USB_S = 0.2e-3  # there and back: a Crazyradio 2 is known to carry about 1370 exchanges a second with one Crazyflie
@@ -37,7 +36,8 @@ _RADIO = re.compile(
     r"radio://(?P<radio>\*|\d{1,9}|[0-9A-Fa-f]{10})"
     r"(?:/(?P<channel>\d{1,3})(?:/(?P<rate>250K|1M|2M)(?:/(?P<node>[0-9A-Fa-f]{1,10}))?)?)?/?(?:\?[\w=&.]*)?"
 )
-_NETWORK, _WIRED = ("udp", "tcp"), ("usb", "serial", "prrt")
+_NETWORK = re.compile(r"(?P<scheme>udp|tcp)://(?P<host>[\w.-]+):(?P<port>\d{1,6})/?")
+_WIRED = re.compile(r"(?P<scheme>usb|serial|prrt)://[\w./:-]+")
 
 
 class LinkError(DtsaError):
@@ -73,15 +73,13 @@ def parse_address(uri: str) -> Address:
         if channel > LAST_CHANNEL:
             raise ConfigError("uri", uri, f"a channel from 0 to {LAST_CHANNEL}")
         return Address(uri, "radio", match["radio"].upper(), channel, match["rate"] or "2M", node)
-    parts = urlsplit(uri.rstrip("/"))
-    if parts.scheme in _NETWORK and parts.hostname and not parts.path:
-        with suppress(ValueError):  # larger than a port can be
-            if parts.port:
-                host = "127.0.0.1" if parts.hostname == "localhost" else parts.hostname
-                return Address(uri, parts.scheme, host=host, port=parts.port)
-        raise ConfigError("uri", uri, "a port from 1 to 65535")
-    if parts.scheme in _WIRED and (parts.netloc or parts.path):
-        return Address(uri, parts.scheme)
+    if match := _NETWORK.fullmatch(uri):
+        host, port = match["host"].lower(), int(match["port"])
+        if not 1 <= port <= LAST_PORT:
+            raise ConfigError("uri", uri, f"a port from 1 to {LAST_PORT}")
+        return Address(uri, match["scheme"], host="127.0.0.1" if host == "localhost" else host, port=port)
+    if match := _WIRED.fullmatch(uri):
+        return Address(uri, match["scheme"])
     raise ConfigError("uri", uri, _ALLOWED)
 
 
@@ -92,7 +90,7 @@ def check_distinct(robots: Sequence[tuple[str, Address]]) -> None:
     for name, address in robots:
         link = address.link
         if address.port and ports.count((address.scheme, address.port)) > 1:
-            with suppress(OSError):
+            with suppress(OSError, UnicodeError):  # not known, or no name of a host
                 link = f"{address.scheme} {socket.gethostbyname(address.host)}:{address.port}"
         if link in names:
             allowed = f"a Crazyflie of its own ({names[link]} is reached by the same link)"

@@ -164,10 +164,12 @@ class Bridge:
     def _apply_rules(self, now: float, feed: bool) -> None:
         vehicles = self.vehicles.values()
         age = None if self.heartbeat is None else now - self.heartbeat
+        for vehicle in vehicles if feed else ():  # before the rules: if one fails, no motors stop for that
+            vehicle.feed_watchdog(now)
         for required in self.monitor.check(now, [v.watched_state(now) for v in vehicles], age):
             self._carry_out(required, now)
         for vehicle in vehicles:
-            vehicle.tick(now, feed)
+            vehicle.tick(now)
 
     def _carry_out(self, required: RequiredAction, now: float) -> None:
         action, reason = required.action, required.reason

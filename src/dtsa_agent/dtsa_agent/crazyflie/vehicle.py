@@ -72,7 +72,7 @@ class CrazyflieVehicle:
         self.guarded = False  # the firmware's emergency watchdog is running
         self.last: VehicleState | None = None  # what it has reported last
         self.refused = 0  # streamed commands that did not count
-        self.longer = ""  # that the last landing takes longer than ordered, and why
+        self.longer = ""  # that the present landing takes longer than ordered, and why
         self._log, self._publish = log, on_state
         self._log_times: deque[float] = deque(maxlen=200)
         self._trusted_height = 0.0  # m, the last one before the estimate was wrong
@@ -109,6 +109,7 @@ class CrazyflieVehicle:
         level = "error" if state in (State.EMERGENCY, State.LOST) else "info"
         self._log(level, f"{self.name}: {before.name.lower()} -> {state.name.lower()} ({reason})")
         self.action = reason
+        self.longer = "" if before == State.LANDING else self.longer
         if before == State.LANDING and state == State.ARMED:
             self.link.order(lambda cf: cf.supervisor.send_arming_request(False))
 
@@ -511,11 +512,8 @@ class CrazyflieVehicle:
                 self.land(reason)
                 self._landings = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
 
-    def tick(self, now: float, feed: bool) -> None:
-        """Called 50 times a second: goes on with a stream of its own, and sends again what has not been answered.
-
-        :param feed: send the emergency stop watchdog, and blind landings that are due.
-        """
+    def tick(self, now: float) -> None:
+        """Called 50 times a second: goes on with a stream of its own, and sends again what has not been answered."""
         with self.lock:
             self._paused &= self.tracker.age(now) > self.station.safety.position_age_s
             self._go_on(now)
@@ -523,16 +521,16 @@ class CrazyflieVehicle:
                 self.link.order_log(now)
             if self.state in WATCHED and self._order is not None and (order := self._order.due(now)) is not None:
                 self.link.order(order)
-            if feed:
-                self._feed_watchdog(now)
 
-    def _feed_watchdog(self, now: float) -> None:
-        if self._landings and now >= self._landings[0]:
-            self._landings.pop(0)
-            self._streaming = True  # it must end a stream that the firmware may still follow
-            self._descend(0.0, BLIND_LAND_S)
-        # From the first arming on: once it has begun, the firmware locks itself when it ends.
-        self.guarded |= self.station.safety.emergency_watchdog and self.state in WATCHED
-        self.link.guarded = self.guarded
-        if self.guarded and self.state not in (*OFF, State.EMERGENCY):
-            self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())
+    def feed_watchdog(self, now: float) -> None:
+        """Called `WATCHDOG_HZ` times a second: sends the emergency stop watchdog, and a blind landing that is due."""
+        with self.lock:
+            if self._landings and now >= self._landings[0]:
+                self._landings.pop(0)
+                self._streaming = True  # it must end a stream that the firmware may still follow
+                self._descend(0.0, BLIND_LAND_S)
+            # From the first arming on: once it has begun, the firmware locks itself when it ends.
+            self.guarded |= self.station.safety.emergency_watchdog and self.state in WATCHED
+            self.link.guarded = self.guarded
+            if self.guarded and self.state not in (*OFF, State.EMERGENCY):
+                self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog())

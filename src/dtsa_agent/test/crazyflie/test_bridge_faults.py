@@ -147,6 +147,21 @@ def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> 
 
 
 @pytest.mark.realtime
+def test_rules_that_fail_stop_no_motors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with fake_fleet(tmp_path, 1) as fleet, flight(settings(fleet)) as pilot:
+        pilot.bridge.connect()
+        pilot.take_off()
+        with monkeypatch.context() as broken:
+            broken.setattr(pilot.bridge.monitor, "check", lambda *_: 1 / 0)
+            time.sleep(1.5)  # longer than the firmware's emergency watchdog waits
+        pilot.logged("safety: ZeroDivisionError")
+        assert pilot.state(1) is State.FLYING
+        assert not [e for e in fleet.events(1, "state") if e["state"] == "locked"]
+        pilot.bridge.land_all("test over")
+        assert pilot.bridge.wait_landed(lambda: False) == []
+
+
+@pytest.mark.realtime
 def test_crazyswarm2s_voltages_count_on_the_ground_alone(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2) as fleet:
         data = settings(fleet, battery={"voltage_warning": 3.8, "voltage_critical": 3.7})  # of its stock file

@@ -89,7 +89,9 @@ def test_what_is_too_short_is_refused_and_motors_never_stop_between_a_stream_and
             assert cf.state is State.FLYING
             assert cf.land("test", 0.0, 0.2) == ""
             pilot.logged(r"cf1: landing takes [12]\..* s: duration 0\.20 s is too short")
+            assert "duration 0.20 s is too short" in cf.longer
             wait_for(lambda: cf.state is State.READY)
+            assert cf.longer == ""  # what is said of this landing is not said of a later one
         names = [e["event"] for e in fleet.events(1)]
         assert names.count("takeoff") == 1
         assert names.count("go_to") >= 4

@@ -73,7 +73,9 @@ def cf1(**more: Any) -> dict[str, Any]:
     (swarm(robots={"cf1": {"uri": "radio:/0"}}), "robots.cf1.uri"), (cf1(type="big"), "robots.cf1.type"),
     (cf1(id=0), "robots.cf1.id"), (cf1(log_rate_hz=200), "robots.cf1.log_rate_hz"),
     *((cf1(initial_position=place), "robots.cf1.initial_position") for place in ([1, 2], [math.nan, 0, 0])),
-    *((cf1(uri=uri), "robots.cf1.uri") for uri in ("radio://0/200/2M/E7E7E7E701", "udp://h:99999", "udp://h:0")),
+    *((cf1(uri=uri), "robots.cf1.uri") for uri in (
+        "radio://0/200/2M/E7E7E7E701", "udp://h:99999", "udp://h:0", "udp://[h:1", "udp://me@h:1", "udp://h:1?a", "usb://[",
+    )),
     (cf1(firmware_params={"locSrv": {"extPosStdDev": math.nan}}), "robots.cf1.firmware_params.locSrv.extPosStdDev"),
     (swarm(robots=["cf1", "cf2"]), "robots"),
     (swarm(station={"safety": {"geofence_max": [1.5, math.inf, 1]}}), "station.safety.geofence_max"),
@@ -116,6 +118,7 @@ def test_what_only_looks_alike_is_two_robots() -> None:
     for one, other in (
         (RADIO, "radio://0/81/2M/E7E7E7E701"), (RADIO, "radio://0/80/1M/E7E7E7E701"),
         ("udp://h:1", "tcp://h:1"), ("udp://127.0.0.1:1", "udp://127.0.0.2:1"), ("serial://ttyA", "serial://ttyB"),
+        ("udp://a..b:1", "udp://127.0.0.1:1"),
     ):  # fmt: skip
         assert len(parse_swarm(swarm(robots={"cf1": {"uri": one}, "cf2": {"uri": other}})).robots) == 2
 

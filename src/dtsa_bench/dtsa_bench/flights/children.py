@@ -94,6 +94,7 @@ class Children:
     def stop(self, hurry: bool = False) -> None:
         """Wait until all have ended, and help those that do not."""
         leave_s, term_s = (_HURRY_S, _HURRY_S) if hurry else (_LEAVE_S, _TERM_S)
+        # 0 is no signal: at first they are given time to end by themselves.
         for number, patience in ((0, leave_s), (signal.SIGTERM, term_s), (signal.SIGKILL, 10.0)):
             alive = [child for child in self.all if not child.has_ended]
             for child in alive:

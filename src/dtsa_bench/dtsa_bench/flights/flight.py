@@ -91,7 +91,7 @@ class Flight:
 
     summary: dict[str, Any]  # as in summary.json
     scenario: Scenario
-    positions: NDArray[np.float64]  # (T, 3, N) m, frame map, at the start of each slot
+    positions: NDArray[np.float64]  # (T, 3, N) m, frame map, at starts of slots: of all, or evenly spread ones
     bag: Path
 
 

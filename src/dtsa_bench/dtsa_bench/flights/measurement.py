@@ -16,28 +16,21 @@ from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver
 
+from .statistics import EvenlySpread
+
 _MAX_PATH_BYTES = 1 << 24
 
 
-class FlightPath:
-    """Where all were at the starts of slots, in bounded memory: when it is full, every second slot is forgotten."""
+class FlightPath(EvenlySpread[NDArray[np.float64]]):
+    """Where all were at the starts of slots, each (3, N) m, frame map."""
 
     def __init__(self, agents: int) -> None:
-        self._kept: list[NDArray[np.float64]] = []
-        self._agents, self._slots, self._every = agents, 0, 1
-
-    def append(self, position: NDArray[np.float64]) -> None:
-        """Add a slot, (3, N) m, frame map."""
-        if self._slots % self._every == 0:
-            self._kept.append(position.copy())
-        self._slots += 1
-        if len(self._kept) * position.nbytes > _MAX_PATH_BYTES:
-            del self._kept[1::2]
-            self._every *= 2
+        super().__init__(_MAX_PATH_BYTES // (3 * agents * 8))
+        self._agents = agents
 
     def array(self) -> NDArray[np.float64]:
         """(T, 3, N) m, frame map."""
-        return np.array(self._kept).reshape(-1, 3, self._agents)
+        return np.array(self.kept).reshape(-1, 3, self._agents)
 
 
 class FlightMeasurement(ChannelObserver):
@@ -65,7 +58,7 @@ class FlightMeasurement(ChannelObserver):
         self.begin_s = at_s
 
     def all_answered(self, slot: int, answers: Answers) -> None:
-        self.positions.append(answers.position)
+        self.positions.append(answers.position.copy())
         if not slot:
             self.begin_s = self.begin_s or time.monotonic()
             return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,30 +69,39 @@ def warning(channel: RealtimeChannel, summary: dict[str, Any]) -> str | None:
 ON_TIME_NS = 1_000_000  # a frame this far from the swarm's common time is not on time any more
 _END = 50  # slots
 _OPEN = 1000  # slots that are not summed up yet
-_KEPT = 4096  # frames of an agent for the median: all until there are more, then evenly spread ones
+_KEPT = 4096  # frames of an agent for the median
+Value = TypeVar("Value")
 
 
-class _Sends:
-    """How far an agent's frames left from the swarm's common time, in constant memory."""
+class EvenlySpread(Generic[Value]):
+    """Values of a series in bounded memory: all until there are too many, then evenly spread ones."""
 
-    def __init__(self) -> None:
-        self.count = self.on_time = 0
-        self.largest = 0.0  # ns, the one farthest away
-        self._kept: list[float] = []
-        self._every = 1
+    def __init__(self, most: int) -> None:
+        self.kept: list[Value] = []
+        self.count, self._most, self._every = 0, most, 1
 
-    def add(self, away_ns: float) -> None:
+    def append(self, value: Value) -> None:
+        """Add a value; when there is no more room, every second one is forgotten."""
         if self.count % self._every == 0:
-            self._kept.append(away_ns)
-            if len(self._kept) > _KEPT:
-                del self._kept[1::2]
+            self.kept.append(value)
+            if len(self.kept) > self._most:
+                del self.kept[1::2]
                 self._every *= 2
         self.count += 1
-        self.on_time += abs(away_ns) <= ON_TIME_NS
-        self.largest = max(self.largest, away_ns, key=abs)
 
-    def median(self) -> float:
-        return float(np.median(self._kept))
+
+class _Sends(EvenlySpread[float]):
+    """How far an agent's frames left from the swarm's common time, ns."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT)
+        self.on_time = 0
+        self.largest = 0.0  # the one farthest away
+
+    def append(self, value: float) -> None:
+        super().append(value)
+        self.on_time += abs(value) <= ON_TIME_NS
+        self.largest = max(self.largest, value, key=abs)
 
 
 class TimingStatistics(ChannelObserver):
@@ -139,7 +148,7 @@ class TimingStatistics(ChannelObserver):
             self._last_spreads.append(spread)
         for index in np.flatnonzero(~np.isnan(sends)).tolist() if count else ():
             median = (usable[(count - 1) // 2] + usable[count // 2]) / 2
-            self._away.setdefault(index + 1, _Sends()).add(float(sends[index] - median))
+            self._away.setdefault(index + 1, _Sends()).append(float(sends[index] - median))
 
     def summary(self) -> dict[str, Any]:
         """The results; None where nothing was reported.
@@ -165,7 +174,7 @@ class TimingStatistics(ChannelObserver):
             "clock_spread_end_ms": max(self._last_spreads) / 1e6 if self._spreads else None,
             "sends_on_time_share": sum(sends.on_time for sends in self._away.values()) / frames if frames else None,
             "send_offset_ms": {
-                str(agent): {"median": sends.median() / 1e6, "max": sends.largest / 1e6}
+                str(agent): {"median": float(np.median(sends.kept)) / 1e6, "max": sends.largest / 1e6}
                 for agent, sends in sorted(self._away.items())
             },
         }  # fmt: skip

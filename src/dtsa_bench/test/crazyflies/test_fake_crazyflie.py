@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import struct
+import threading
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -105,13 +106,37 @@ def test_two_that_meet_fall() -> None:
 @pytest.mark.parametrize(("request_", "field"), [
     ({"fault": "explode"}, "fault"), ({"fault": "drop", "cf": 3}, "cf"), ({"fault": "drop", "cf": "one"}, "cf"),
     ({"fault": "drop", "rate": 1.5}, "rate"), ({"fault": "drop", "direction": "left"}, "direction"),
-    ({"fault": "battery", "voltage": 9}, "voltage"),
+    ({"fault": "battery", "voltage": 9}, "voltage"), ({"fault": "battery", "voltage": None}, "voltage"),
+    ({"fault": "estimate_jump", "distance": None}, "distance"),
 ])  # fmt: skip
 def test_bad_faults_are_refused(request_: dict[str, Any], field: str) -> None:
     with closing(Fleet(FleetConfig(count=2, base_port=free_base_port(2)))) as fleet:
         with pytest.raises(ConfigError) as error:
             fleet.fault(request_)
         assert error.value.field == field
+
+
+def test_nothing_that_comes_to_the_port_for_faults_ends_a_fleet() -> None:
+    config = FleetConfig(count=1, base_port=free_base_port(1))
+    fleet = Fleet(config)
+    flying = threading.Thread(target=fleet.run)
+    flying.start()
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as host:
+            host.settimeout(5)
+            host.connect(("127.0.0.1", config.control_port))
+            for request, field in (
+                (b'{"fault": ["drop"]}', "fault"), (b'{"fault": {}}', "fault"), (b"[]", "request"),
+                (b"[" * 2000, "request"), (b'{"fault": ' + b"[" * 1010 + b"]" * 1010 + b"}", "request"),
+            ):  # fmt: skip
+                host.send(request)
+                answer = json.loads(host.recv(8192))
+                assert (answer["ok"], answer["field"]) == (False, field)
+            host.send(b'{"fault": "heal"}')
+            assert json.loads(host.recv(512))["ok"] is True
+    finally:
+        fleet.stop()
+        flying.join(10)
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,7 @@ class Firmware:
             self.planner.state = IDLE
             self._report("high-level stop")
             return 0
-        here, state = self._here, self.planner.state
+        here = self._here
         if kind == 12:
             _, relative, _, x, y, z, yaw, duration = struct.unpack_from("<B??5f", data, 1)
             if relative:
@@ -175,8 +175,8 @@ class Firmware:
             self._report("go_to", goal=[round(v, 3) for v in (x, y, z)])
             return 0
         _, height, yaw, keep_yaw, duration = struct.unpack_from("<Bff?f", data, 1)
-        takes_off = kind == 7
-        if state != IDLE if takes_off else state == LANDING:
+        takes_off, state = kind == 7, self.planner.state
+        if (takes_off and state != IDLE) or (not takes_off and state == LANDING):  # it flies, or lands, already
             return 1
         place, yaw = (*here.position[:2], height), self.yaw if keep_yaw else yaw
         self.planner.plan(FLYING if takes_off else LANDING, t, Goal(here.position), place, yaw, duration)  # from rest

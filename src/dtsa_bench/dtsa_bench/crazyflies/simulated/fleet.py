@@ -228,7 +228,7 @@ class Fleet:
         name, indices = check_fault(request, self.config.count)
         for k in indices:
             self._apply(name, k, request)
-            if request.get("seconds") is not None:
+            if "seconds" in request:
                 self._links[k].heal_at = self.time + request["seconds"]
 
     def _apply(self, name: str, index: int, request: dict[str, Any]) -> None:

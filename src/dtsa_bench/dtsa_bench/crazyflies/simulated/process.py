@@ -124,8 +124,8 @@ def check_fault(request: dict[str, Any], count: int) -> tuple[str, list[int]]:
         if not isinstance(i, int) or isinstance(i, bool) or not 1 <= i <= count:
             raise ConfigError("cf", i, f'1 to {count}, or "all"')
     for name, (low, high) in NUMBERS.items():
-        value = request.get(name)
-        if value is not None and not (isinstance(value, (int, float)) and low <= value <= high):
+        value = request.get(name, low)
+        if not (isinstance(value, (int, float)) and low <= value <= high):
             raise ConfigError(name, value, f"{low:g} to {high:g}")
     if request.get("direction", "both") not in DIRECTIONS:
         raise ConfigError("direction", request["direction"], "up, down or both")
