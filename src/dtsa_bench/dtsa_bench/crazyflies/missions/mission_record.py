@@ -13,6 +13,7 @@ import math
 import signal
 import sys
 import time
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +43,44 @@ _LEVELS = {10: "debug", 20: "info", 30: "warn", 40: "error", 50: "fatal"}
 _IN_FLIGHT = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
 
 
+@dataclass(slots=True)
+class VehicleLog:
+    """One vehicle's part."""
+
+    battery_first_v: float | None = None
+    battery_last_v: float | None = None
+    battery_least_v: float | None = None
+    link_quality_least: float = 1.0  # this and the next two from arming on
+    log_age_most_s: float = 0.0
+    latency_most_ms: float = 0.0  # of a command, 99th percentile
+    states: list[dict[str, Any]] = field(default_factory=list)  # t_s, state, reason: each change
+
+
 class MissionLog:
-    """Collects. For one thread, the executor's."""
+    """Collects, in memory that does not grow with the mission. For one thread, the executor's."""
 
     def __init__(self) -> None:
         self.began = time.time()
-        self.statuses: dict[str, list[tuple[float, Status]]] = {}  # s since the beginning, by vehicle
+        self.vehicles: dict[str, VehicleLog] = {}
         self.events: list[dict[str, Any]] = []
         self.diagnostics: dict[str, dict[str, float | str]] = {}  # what the bridge said last about each
         self.dropped = 0
 
     def status(self, name: str, message: Status) -> None:
         """A vehicle's status."""
-        self.statuses.setdefault(name, []).append((time.time() - self.began, message))
+        log = self.vehicles.setdefault(name, VehicleLog())
+        volts = round(float(message.battery_voltage), 3)
+        if volts > 0.0:
+            log.battery_first_v = log.battery_first_v or volts
+            log.battery_least_v = min(volts, log.battery_least_v or volts)
+            log.battery_last_v = volts
+        if message.state in _IN_FLIGHT:
+            log.link_quality_least = min(log.link_quality_least, round(float(message.link_quality), 3))
+            log.log_age_most_s = max(log.log_age_most_s, round(float(message.log_age), 3))
+            log.latency_most_ms = max(log.latency_most_ms, round(float(message.latency_ms), 2))
+        if not log.states or log.states[-1]["state"] != message.state_name:
+            when = round(time.time() - self.began, 3)
+            log.states.append({"t_s": when, "state": message.state_name, "reason": message.reason})
 
     def diagnostic(self, message: DiagnosticArray) -> None:
         """Diagnostics; only the bridge's count."""
@@ -73,36 +99,18 @@ class MissionLog:
 
     def write(self, directory: Path, reason: str) -> None:
         """Write `mission.json` in the flight's directory; `reason`: why the mission was cut short, or ""."""
-        names = sorted(self.statuses, key=lambda name: (len(name), name))  # cf9 before cf10
+        logs = sorted(self.vehicles.items(), key=lambda item: (len(item[0]), item[0]))  # cf9 before cf10
         content = {
             "began_unix_s": round(self.began, 3),
             "duration_s": round(time.time() - self.began, 3),
             "cut_short": reason,
-            "vehicles": {name: self._vehicle(self.statuses[name]) | {"last": self.diagnostics.get(name, {})}
-                         for name in names},
+            "vehicles": {name: asdict(log) | {"last": self.diagnostics.get(name, {})} for name, log in logs},
             "events": sorted(self.events, key=lambda event: event["t_s"]),
             "events_left_out": self.dropped,
-        }  # fmt: skip
+        }
         path = directory / "mission.json.part"
         path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         path.replace(directory / "mission.json")
-
-    @staticmethod
-    def _vehicle(statuses: list[tuple[float, Status]]) -> dict[str, Any]:
-        """One vehicle's part; link, ages and latency (of a command, 99th percentile) are those from arming on."""
-        volts = [v for _, message in statuses if (v := round(float(message.battery_voltage), 3)) > 0.0] or [None]
-        flying = [message for _, message in statuses if message.state in _IN_FLIGHT]
-        states: list[dict[str, Any]] = []  # each change
-        for t_s, message in statuses:
-            if not states or states[-1]["state"] != message.state_name:
-                states.append({"t_s": round(t_s, 3), "state": message.state_name, "reason": message.reason})
-        return {
-            "battery_first_v": volts[0], "battery_last_v": volts[-1], "battery_least_v": min(volts),
-            "link_quality_least": min([1.0, *(round(float(message.link_quality), 3) for message in flying)]),
-            "log_age_most_s": max([0.0, *(round(float(message.log_age), 3) for message in flying)]),
-            "latency_most_ms": max([0.0, *(round(float(message.latency_ms), 2) for message in flying)]),
-            "states": states,
-        }  # fmt: skip
 
 
 def _number(text: str) -> float | str:
