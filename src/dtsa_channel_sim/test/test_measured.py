@@ -59,7 +59,8 @@ def test_settings_come_back_from_plain_values():
     (losses(loss_bad=1.5), r"losses.loss_bad\[0\]\[1\]"),
     ({**losses(), "leave": [[1.0]]}, r"losses.leave: got 'shape \(1, 1\)'"),
     ({**losses(), "loss_good": "all"}, "losses.loss_good"), (losses(format="dtsa-losses 1"), "losses.format"),
-    (losses(slot_ns=20_000_000), "slots of 20 ms"), (losses(3), "of 3 agents"),
+    (losses(slot_ns=20_000_000), "slots of 20 ms"), (losses(slot_ns=10**400), "losses.slot_ns"),
+    ({**losses(), "loss_bad": [[10**400] * 4] * 4}, "losses.loss_bad"), (losses(3), "of 3 agents"),
 ])  # fmt: skip
 def test_what_cannot_be_used_is_named(given_losses, field):
     with pytest.raises(ConfigError, match=field):
@@ -75,7 +76,7 @@ def test_files_that_are_none_are_refused(tmp_path):
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "list.json").write_text("[1]")
     (tmp_path / "deep.json").write_text("[" * 100_000)
-    for name in ("bytes.json", "list.json", "deep.json", "", "none.json"):
+    for name in ("bytes.json", "list.json", "deep.json", "", "none.json", "long" * 100, "nul\0"):
         with pytest.raises(ConfigError, match="losses"):
             ChannelConfig(agents=2, losses=str(tmp_path / name))
 

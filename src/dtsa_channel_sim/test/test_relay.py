@@ -165,6 +165,48 @@ def test_quality_of_service_is_the_publishers_and_a_latched_message_reaches_all(
     assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
 
 
+PERSISTENT = """<dds xmlns="http://www.eprosima.com"><profiles>
+<data_writer profile_name="/robot1/text"><qos><durability><kind>TRANSIENT</kind></durability></qos>
+<propertiesPolicy><properties>
+<property><name>dds.persistence.plugin</name><value>builtin.SQLITE3</value></property>
+<property><name>dds.persistence.sqlite3.filename</name><value>{database}</value></property>
+<property><name>dds.persistence.guid</name>
+<value>77.72.69.74.65.72.5f.70.65.72.73.5f|67.75.69.64</value></property>
+</properties></propertiesPolicy></data_writer>
+</profiles></dds>"""
+PUBLISHER = """
+import rclpy, time
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+rclpy.init()
+publisher = rclpy.create_node("persistent").create_publisher(
+    String, "/robot1/text", QoSProfile(depth=10, durability=DurabilityPolicy.SYSTEM_DEFAULT))
+while True:
+    publisher.publish(String(data="x"))
+    time.sleep(0.05)
+"""
+
+
+def test_a_publisher_with_a_policy_that_ros_does_not_know_is_relayed(graph: Graph, tmp_path: Path) -> None:
+    """A writer of DDS that keeps its messages in a file."""
+    profiles = tmp_path / "profiles.xml"
+    profiles.write_text(PERSISTENT.format(database=tmp_path / "messages.db"), encoding="utf-8")
+    environment = {"RMW_FASTRTPS_USE_QOS_FROM_XML": "1", "FASTRTPS_DEFAULT_PROFILES_FILE": str(profiles)}
+    graph.processes.append(
+        subprocess.Popen(
+            [sys.executable, "-c", PUBLISHER], env=graph.environment | environment, stderr=subprocess.PIPE, text=True
+        )
+    )
+    topic = "/robot1/text"
+    graph.until(lambda: graph.node.get_publishers_info_by_topic(topic))
+    (info,) = graph.node.get_publishers_info_by_topic(topic)
+    assert info.qos_profile.durability == DurabilityPolicy.UNKNOWN
+    relay(graph, tmp_path / "relay.yaml", {}, TWO)
+    texts: list[String] = []
+    graph.node.create_subscription(String, "/robot2/from/robot1/text", texts.append, 10)
+    graph.until(lambda: texts)
+
+
 def test_odometry_says_who_is_in_range(graph: Graph, tmp_path: Path) -> None:
     """Until it is known where a robot is, and beyond the range, nothing reaches it; odometry may be nonsense."""
     robots = {"robot1": {**TWO["robot1"], "place": [0, 0, 0]}, "robot2": {"odometry": "odom"}}

@@ -122,6 +122,33 @@ def test_a_radio_that_finds_no_free_air_gives_up() -> None:
     assert carrier.counts["received"][0, 1] == 1
 
 
+def test_what_waits_behind_a_message_that_is_given_up_is_listened_for_from_then_on() -> None:
+    """However often it is advanced: the air before is resolved already."""
+    counts = []
+    for step_ms in (1, 2_000):
+        carrier = transport(2, access="csma", longest=100_000, backoff_ms=0.5)
+        carrier.send(message(carrier, 1, 0, 0, length=100_000))
+        carrier.advance(10 * MS)
+        for number in range(20):
+            carrier.send(RadioMessage(2, str(number), number, 40, 10 * MS, np.array([True, False])))
+        for now_ms in range(10, 2_011, step_ms):
+            carrier.advance(now_ms * MS)
+        carrier.advance(2_010 * MS)
+        assert accounted(carrier)
+        counts.append({name: values.tolist() for name, values in carrier.counts.items()})
+    assert counts[0] == counts[1]
+    assert 0 < counts[0]["dropped"][1][0] < 20
+
+
+def test_the_newest_message_is_that_sent_last_though_longer_ones_arrive_later() -> None:
+    carrier = transport(2)
+    long, short = message(carrier, 1, 0, 0, length=4000), message(carrier, 1, 1, MS)
+    for sent in (long, short):
+        carrier.send(sent)
+    assert [arrived for arrived, _ in carrier.advance(100 * MS)] == [short, long]
+    assert carrier.newest[1, 0] is short
+
+
 @pytest.mark.parametrize("access", ACCESS[1:])
 def test_queues_keep_the_newest(access: str) -> None:
     carrier = transport(2, access=access, queue=3, bitrate=10_000, slot_ms=100)

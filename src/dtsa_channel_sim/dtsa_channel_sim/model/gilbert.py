@@ -8,6 +8,7 @@ without walking through all others, and slots without a frame count like any oth
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +22,6 @@ from .draws import WordBlocks, matrix_of, thresholds
 
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.float64]
-_FIRST_STEP = 32  # slots that a look back begins with
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +74,9 @@ class Chains:
         self._enter = thresholds(model.enter, words.agents)
         self._keep = thresholds(1.0 - model.leave, words.agents)
         self._share = thresholds(model.bad_share, words.agents)
+        # So many slots nearly always have a word that decides, for each link of a sender.
+        kept = float(np.clip(1.0 - model.enter - model.leave, 1e-9, 1.0 - 1e-9).max())
+        self._first_step = min(words.rows, max(8, round((math.log(words.agents) + 4.0) / -math.log(kept))))
         self._receivers = range(0)  # slots whose states are known of all receivers,
         self._states: Mask = np.zeros((0, words.agents), np.bool_)  # and these
         self._seen: dict[int, tuple[int, Mask]] = {}  # slot and states of the last look at each sender's links
@@ -108,16 +111,17 @@ class Chains:
         columns = np.arange(self._words.agents)
         known = np.zeros(len(columns), np.bool_)
         bad = known if before is None else before
-        end, step = slot + 1, _FIRST_STEP
-        while end > floor + 1 and not known.all():
+        end, step = slot + 1, self._first_step
+        while True:
             first = max(floor + 1, end - step)
             value, decided = self._decide(first, end, sender)
             last = len(value) - 1 - np.argmax(decided[::-1], axis=0)
             found = decided[last, columns]
             bad = np.where(found & ~known, value[last, columns], bad)
             known = known | found
+            if first == floor + 1 or known.all():
+                return bad
             end, step = first, min(2 * step, 4 * self._words.rows)
-        return bad
 
     def _decide(self, first: int, end: int, sender: int) -> tuple[Mask, Mask]:
         """Return (bad, decided) by the words of some slots, (end - first, N)."""

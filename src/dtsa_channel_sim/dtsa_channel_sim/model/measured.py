@@ -104,10 +104,11 @@ def losses_of(value: object) -> MeasuredLosses | str:
 def _read(path: Path) -> MeasuredLosses:
     import hashlib  # an agent in flight has the settings of channels in memory, and no need of hashes
 
-    if path.is_file() and path.stat().st_size > _MOST_BYTES:
-        raise ConfigError("losses", str(path), f"a file of at most {_MOST_BYTES} bytes")
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise ValueError(f"more than {_MOST_BYTES} bytes")
         content: Any = json.loads(data)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError("losses", str(path), f"a file of JSON that `losses` has written ({error})") from None

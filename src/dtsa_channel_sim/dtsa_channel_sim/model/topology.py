@@ -110,7 +110,7 @@ def parse_matrix(value: object, agents: int, name: str = "loss_matrix") -> Matri
         return ()
     try:
         matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ConfigError(name, value, f"{agents} rows of {agents} numbers from 0 to 1") from None
     if matrix.size == 0:
         return ()

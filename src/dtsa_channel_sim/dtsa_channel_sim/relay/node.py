@@ -100,7 +100,9 @@ class Relay:
             if robot.odometry:
                 topic = full_name(name, robot.odometry, "odometry")
                 self._follow("nav_msgs/msg/Odometry", topic, partial(self._accept_odometry, row))
-            elif not robot.tf:
+            elif robot.tf:
+                self._positions[:, row] = self._tree.place_of(robot.tf)
+            else:
                 self._positions[:, row] = robot.place or 0.0  # 0: it does not matter
         for topic in ("/tf", "/tf_static") if any(robot.tf for robot in self._robots.values()) else ():
             self._follow("tf2_msgs/msg/TFMessage", topic, self._tree.accept)
@@ -145,12 +147,14 @@ class Relay:
         self._positions[:, row] = numbers
 
     def _update_positions(self) -> None:
+        is_changed = False
         for feed, accept in self._feeds:
             for message in itertools.islice(iter(feed.take, None), _DEPTH):
+                is_changed = True
                 with self._intake.guard():
                     accept(message)
         for row, robot in enumerate(self._robots.values()):
-            if robot.tf:
+            if is_changed and robot.tf:
                 self._positions[:, row] = self._tree.place_of(robot.tf)
 
     # Messages.
@@ -179,9 +183,10 @@ class Relay:
         except ConfigError as error:
             self._logger.error(f"{topic.source}: {error}")
             return True
-        # The weaker of two policies is the larger number.
-        reliability = max(info.qos_profile.reliability for info in publishers)
-        durability = max(info.qos_profile.durability for info in publishers)
+        # The weaker of two policies is the larger number; one that ROS does not know has a number above both.
+        profiles = [info.qos_profile for info in publishers]
+        reliability = min(max(qos.reliability for qos in profiles), ReliabilityPolicy.BEST_EFFORT)
+        durability = min(max(qos.durability for qos in profiles), DurabilityPolicy.VOLATILE)
         qos = QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability)
         for row in np.flatnonzero(topic.receivers).tolist():
             name = f"/{self._names[row]}/from/{self._names[topic.robot - 1]}/{topic.name.strip('/')}"

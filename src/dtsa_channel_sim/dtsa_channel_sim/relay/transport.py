@@ -76,7 +76,7 @@ class Transport:
     def __init__(self, config: MessageChannel) -> None:
         agents, self.config = config.agents, config
         self.counts = {name: np.zeros((agents, agents), np.int64) for name in (*COUNTS, "delay_ns")}  # delay: sum
-        self.newest = np.full((agents, agents), None)  # [receiver, sender]: the last message that has come; None: none
+        self.newest = np.full((agents, agents), None)  # [receiver, sender]: newest message that has come; None: none
         self._heard_ns = np.full(agents, -1)  # when the newest message of each was sent that any agent received
         # Noise is drawn by messages, not by slots.
         channel = Channel(replace(config, loss=0.0, burst_length=0.0, link_loss=(), loss_matrix=(), losses=""))
@@ -132,7 +132,9 @@ class Transport:
         self._resolve(until_ns)
         arrived = self._arriving.pop(until_ns)
         for message, received in arrived:
-            self.newest[received, message.sender - 1] = message
+            known = self.newest[:, message.sender - 1]
+            is_newer = [other is None or other.at_ns <= message.at_ns for other in known]  # longer ones take longer
+            known[received & is_newer] = message
         return arrived
 
     @property
@@ -186,7 +188,7 @@ class Transport:
             else:
                 self.counts["dropped"][index] += message.receivers
             self._queues[index].popleft()
-            self._schedule(index)
+            self._schedule(index, now_ns)
 
     def _schedule(self, index: int, from_ns: int = 0, backoffs: int = 0) -> None:
         """Say when a radio begins, or listens for, the next message that it has."""

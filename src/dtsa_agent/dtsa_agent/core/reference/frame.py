@@ -45,6 +45,7 @@ FAR_REACH = RELAY_REACH + 8 * (SECTION_BYTES - 1)  # slots ahead of turns that a
 GOSSIP_AGE_MAX = 127  # slots
 LEASE_ROOM = 2 * SECTION_BYTES  # turns that one frame can give away
 C_S_MAX, LEAVING = 253, 255
+MOVES, PROBATION = 1, 2  # bits of byte 3
 OPEN = 255  # lessee of a turn that is open to all who wake
 
 WRONG_LENGTH = "wrong length"
@@ -96,7 +97,7 @@ def encode(frame: Frame, position_step: float, profile: int | None = None) -> by
     is_number = all(x == x for x in (*frame.position, *speeds))
     if not (1 <= frame.sender <= most and 0 <= frame.c_r <= 255 and is_number):
         raise LocalProtocolError(f"not encodable: {frame}")
-    c_r = int(frame.c_r != 0) if profile == PROFILE_EXTENDED else frame.c_r
+    c_r = MOVES * (frame.c_r != 0) if profile == PROFILE_EXTENDED else frame.c_r
     state = [quantise(x, position_step, 16) for x in frame.position]
     state += [quantise(x, VELOCITY_STEP, 12) for x in (frame.velocity if profile == PROFILE_PAPER else speeds)]
     return pack((profile, VERSION, frame.sender, c_r, frame.slot, *state), OWN_BITS)
@@ -116,7 +117,7 @@ def decode(data: bytes, position_step: float) -> Frame:
         raise Refused(WRONG_LENGTH, data)
     _, _, sender, c_r, slot, *steps = unpack(data, OWN_BITS)
     if profile == PROFILE_EXTENDED:
-        sender, c_r = data[1], data[3] & 1
+        sender, c_r = data[1], data[3] & MOVES
         if sender > EXTENDED_SENDER_MAX:
             raise Refused(WRONG_FIELD, data)
     if not sender or (profile == PROFILE_PAPER and any(steps[6:])):
@@ -132,6 +133,13 @@ def sender_and_slot(data: bytes) -> tuple[int, int] | None:
         return None
     _, _, sender, _, slot = unpack(data, OWN_BITS[:5])
     return data[1] if data[0] & 0xF == PROFILE_EXTENDED else sender, slot
+
+
+def condition_of(data: bytes) -> tuple[bool, bool, bool]:
+    """Whether a frame's sender leaves, rests, is on probation; extended frames alone say the first and the last."""
+    if data[0] & 0xF != PROFILE_EXTENDED:
+        return False, not data[3], False
+    return data[2] == LEAVING, not data[3] & MOVES, bool(data[3] & PROBATION)
 
 
 def tag(key: bytes, session: int, slot: int, data: bytes) -> bytes:
@@ -163,9 +171,11 @@ def encode_extended(frame: ExtendedFrame, position_step: float) -> bytes:
     sections = [(KIND_LEASES, frame.leases[first : first + SECTION_BYTES]) for first in parts]
     if frame.relay:
         near = mask_of([ahead for ahead, _ in frame.relay], 0)
-        sections.append((KIND_RELAY, pack((near, *(lessee for _, lessee in frame.relay)), (24, *[8] * RELAY_IDS))))
+        lessees = [lessee for _, lessee in frame.relay]
+        sections.append((KIND_RELAY, pack((near, *lessees), (RELAY_REACH, *[8] * RELAY_IDS))))
     if frame.far:
-        sections.append((KIND_FAR, pack((frame.far_lessee, mask_of(frame.far, RELAY_REACH)), (8, 80))))
+        far = mask_of(frame.far, RELAY_REACH)
+        sections.append((KIND_FAR, pack((frame.far_lessee, far), (8, FAR_REACH - RELAY_REACH))))
     for entry in frame.gossip:
         place = [quantise(x, 2.0 * position_step, 14) for x in entry.position]
         speed = [quantise(x, GOSSIP_VELOCITY_STEP, 10) for x in entry.velocity]
@@ -173,10 +183,11 @@ def encode_extended(frame: ExtendedFrame, position_step: float) -> bytes:
     if len(sections) > SECTIONS:
         raise LocalProtocolError(f"not encodable: {frame}")
     head[2] = LEAVING if frame.leaving else frame.c_s
-    head[3] |= frame.probation << 1
+    head[3] |= PROBATION * frame.probation
     for place_at, (kind, _) in enumerate(sections):
         head[3] |= kind << (2 + 2 * place_at)
-    return (bytes(head) + b"".join(data.ljust(SECTION_BYTES, b"\0") for _, data in sections)).ljust(56, b"\0")
+    body = b"".join(data.ljust(SECTION_BYTES, b"\0") for _, data in sections)
+    return (bytes(head) + body).ljust(EXTENDED_LENGTH, b"\0")
 
 
 def mask_of(ahead: Sequence[int], after: int) -> int:
@@ -214,7 +225,7 @@ def decode_extended(data: bytes, position_step: float) -> ExtendedFrame:
     own = decode(data, position_step)
     if data[0] & 0xF != PROFILE_EXTENDED:
         raise Refused(WRONG_HEADER, data)
-    leaving, probation = data[2] == LEAVING, bool(data[3] >> 1 & 1)
+    leaving, _, probation = condition_of(data)
     is_valid = leaving or data[2] <= C_S_MAX
     gossip: list[Gossip] = []
     leases, far_lessee = b"", 0

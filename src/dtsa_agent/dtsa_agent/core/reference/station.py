@@ -29,7 +29,7 @@ from .datagram import (
     parse_datagram,
     write_datagram,
 )  # fmt: skip
-from .frame import LEAVING, PROFILE_EXTENDED, Refused
+from .frame import Refused, condition_of
 from .table import LEAVES, OFF, Rules
 
 Ns = int  # ns, own clock
@@ -41,7 +41,6 @@ IN_STEP, SHIFTED, RESTARTED, OTHER = range(4)  # what a frame says of the time
 HALF_SECOND_NS = 500_000_000
 RECEPTIONS = 9  # offsets of frames that one alignment takes the median of
 SENT_HISTORY_LENGTH = 16
-MOVES, PROBATION = 1, 2  # of an extended frame, byte 3
 CYCLES = 8  # of lists of one name each, after which an agent that was not named is not heard
 
 
@@ -247,9 +246,9 @@ class Station:
         return not p.left and self._is_recent(p, p.near_ns, now)
 
     def _hear_contact(self, p: Peer, d: Parsed) -> None:
-        extended, most = d.frame[0] & 0xF == PROFILE_EXTENDED, self.settings.link.names
-        p.left = extended and d.frame[2] == LEAVING
-        p.resting = not d.frame[3] & MOVES or bool(d.frame[3] & PROBATION) if extended else not d.frame[3]
+        most = self.settings.link.names
+        p.left, rests, is_on_probation = condition_of(d.frame)
+        p.resting = rests or is_on_probation
         if not most:
             return
         p.unnamed += 1
@@ -422,7 +421,8 @@ class Station:
             return b""
         slot = self.rules.slot_on_air(self.slot)
         datagram = write_datagram(self.settings, self.frame, slot, late_ns, self._names(now))
-        self.gone = self.leaving and self.frame[2] == LEAVING
+        if self.leaving and condition_of(self.frame)[0]:
+            self.gone = True
         self.frame, self.has_sent = b"", True
         self.sent_history.append(datagram)
         return datagram

@@ -116,7 +116,7 @@ class Setting:
             raise ConfigError(name, value, self.allowed)
         if self.kind in _NUMBERS:
             low, high = (value if bound is None else bound for bound in (self.minimum, self.maximum))
-            if not (math.isfinite(value) and low <= value <= high):
+            if not (_is_finite(value) and low <= value <= high):
                 raise ConfigError(name, value, self._number_range or self.allowed)
         if words and not self.open_choices and value not in words:
             raise ConfigError(name, value, self.allowed)
@@ -270,9 +270,16 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number that no float reaches
+        return False
+
+
 def _is_vector(value: Any) -> bool:
     is_triple = isinstance(value, (list, tuple)) and len(value) == 3
-    return is_triple and all(_is_number(x) and math.isfinite(x) for x in value)
+    return is_triple and all(_is_number(x) and _is_finite(x) for x in value)
 
 
 _IS_KIND: dict[str, Callable[[Any], bool]] = {
@@ -287,7 +294,7 @@ def _checked_values(value: object, name: str) -> dict[str, float]:
     for key, number in values.items():
         if not isinstance(key, str) or not _NAME.fullmatch(key):
             raise ConfigError(name, key, "names of letters, digits, dots, dashes and underscores")
-        if not _is_number(number) or not math.isfinite(number):
+        if not _is_number(number) or not _is_finite(number):
             raise ConfigError(f"{name}.{key}", number, "a number")
     return {key: float(number) for key, number in values.items()}
 
