@@ -223,7 +223,7 @@ def _league() -> str:
     ])  # fmt: skip
 
 
-#: What a page may ask for, and what makes it.
+#: Tables that a page may ask for, and their makers.
 TABLES: dict[str, Callable[[], str]] = {
     "SwarmConfig": partial(_grouped, SwarmConfig),
     "SwarmConfig, leases": partial(settings_table, SwarmConfig, ["Frames and leases"]),

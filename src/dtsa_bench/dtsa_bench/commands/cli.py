@@ -16,7 +16,7 @@ from dtsa_bench.runs.program import program
 from .registry import COMMANDS, INTERRUPTED, Command, hint, load_command, report_missing_package
 
 PROGRAM = "dtsa"
-# What `tools/dtsa` knows besides the commands of this package; a test compares.
+# Commands of `tools/dtsa` besides those of this package; a test compares.
 CHECKOUT_COMMANDS = ("setup", "shell", "test", "ros2", "clean")
 
 

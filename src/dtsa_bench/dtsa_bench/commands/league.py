@@ -165,8 +165,8 @@ def _table(args: argparse.Namespace, the_league: League) -> int:
 class NewPluginCommand(Command):
     description = """\
 Writes a package with a policy of your own that works: the policy, a test, a sweep that sets it against the league's
-best and the bound, and the lines that install and run it. What a policy is given and what it
-returns: docs/reference/plug-ins.md."""
+best and the bound, and the lines that install and run it. Input and output of a
+policy: docs/reference/plug-ins.md."""
     examples = (("my-policy --out plugins/my-policy", "then as its README.md says"),)
     options = (
         ("name NAME", "what the policy will be called, as in my-policy"),

@@ -57,7 +57,7 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
 
 
 def read_network_options(args: argparse.Namespace) -> tuple[PortSettings, SwarmConfig]:
-    """What carries the frames, and what all agents share, as options and file say; options go before the file."""
+    """Settings of the port and of the swarm, by options and file; options go before the file."""
     _read_file(args)
     cls = settings_class(args.air)
     specs = {setting.name: setting for setting in settings_of(cls)}
