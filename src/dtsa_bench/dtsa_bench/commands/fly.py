@@ -24,7 +24,7 @@ from dtsa_bench.runs.options import (
     given_options,
     run_config,
     whole_number,
-)  # fmt: skip
+)
 
 from .crazyflies import SIMULATED_RADIO, use_simulated_radio
 from .registry import INTERRUPTED, Command, add_rows, warn
