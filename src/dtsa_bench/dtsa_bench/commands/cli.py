@@ -129,7 +129,7 @@ def _report_system(error: OSError) -> int:
 class CompletionCommand(Command):
     description = """\
 Prints a script for bash or zsh that completes the commands of this program, their options, and the values of
-options that have names. It asks nobody while one types; after an update it is made again."""
+options that have names. It starts no program while you type; make it again after an update."""
     examples = (
         ("bash > ~/.dtsa-completion.bash", "then, in ~/.bashrc: . ~/.dtsa-completion.bash"),
         ("zsh > ~/.zsh/_dtsa", "then, in ~/.zshrc before compinit: fpath=(~/.zsh $fpath)"),
