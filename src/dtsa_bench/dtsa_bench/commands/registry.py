@@ -62,7 +62,10 @@ class Command:
 
 
 def add_rows(parser: argparse._ActionsContainer, rows: Iterable[Row]) -> None:
-    """Add options: ``--flag``, ``--name VALUE`` or ``name VALUE...``, the help, and more arguments for argparse."""
+    """Add options: their words, the help, and more arguments for argparse.
+
+    Words are ``--flag``, ``--name VALUE``, ``name VALUE...`` (one or more) or ``name VALUE*`` (any number).
+    """
     for words, text, *others in rows:
         name, _, value = words.partition(" ")
         more: dict[str, Any] = {"help": text, **(others[0] if others else {})}
