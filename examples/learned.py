@@ -20,7 +20,7 @@ import dtsa
 from dtsa.env import Observer, fields, parallel_env
 
 Floats = NDArray[np.float64]
-#: What the weights are for: the age of what is known of an agent, in rounds; the same if it moves; whether it moves.
+#: Weights of the age of what is known of an agent, in rounds; the same if it moves; whether it moves.
 START = np.array([1.0, 0.0, 0.0])
 #: Swarms to learn from; validation has further seeds of them.
 SWARMS: tuple[dict[str, Any], ...] = (
@@ -65,9 +65,9 @@ class Learned:
 
 
 def cost(weights: Floats, swarm: dict[str, Any], seed: int, record: list[Any] | None = None) -> float:
-    """What a flight costs: the logarithm of its mean age in rounds of TDMA, and 1 more for a crash.
+    """Cost of a flight: the logarithm of its mean age in rounds of TDMA, and 1 more for a crash.
 
-    :param record: takes who sent in each slot.
+    :param record: gets the senders of each slot.
     """
     agents = int(swarm["agents"])
     env = parallel_env(slots=SLOTS, reward=lambda results: 0.0, **COMMON, **swarm)

@@ -1,4 +1,4 @@
-"""What a channel does to an environment of others: simple_spread of mpe2, whose agents share landmarks out among them.
+"""Effect of a channel on an environment of others: simple_spread of mpe2, whose agents share landmarks out among them.
 
 Each agent gives every agent, where it last heard it, a landmark, and goes to its own. It needs mpe2, and draws a
 picture: ``python examples/spread.py PICTURE``.
@@ -19,7 +19,7 @@ FIRST = 4 + 2 * AGENTS  # after its own velocity and place and the landmarks: th
 
 
 def of_others(agent, other):
-    """Which numbers of an agent's observation another agent sends it."""
+    """Numbers of an agent's observation that another agent sends it."""
     rank = [name for name in NAMES if name != agent].index(other)
     return slice(FIRST + 2 * rank, FIRST + 2 * rank + 2)
 

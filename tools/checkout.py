@@ -42,7 +42,7 @@ COMMANDS = {
 # A file's tests share what it flies. When a worker dies, pytest-xdist would give its files to a new one and lose some.
 SIDE_BY_SIDE = ("--dist", "loadfile", "--no-loadscope-reorder", "--max-worker-restart", "0")
 CMAKE_OPTIONS = ("-GNinja", "-DBUILD_TESTING=OFF", "-DCMAKE_BUILD_TYPE=Release", "-DDTSA_PYTHON_ONLY=ON")
-# What the wheels of ROS say of the machine that built them.
+# Paths of the machine that built them, in the wheels of ROS.
 INCLUDE = re.compile(r'[^"\s;]+/(include/python3\.\d+|numpy/(?:_core|core)/include)(?=["\s;])')
 OLDEST_UV = (0, 7)
 FOREIGN = ("PYTHONPATH", "PYTHONHOME", "CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH", "LD_LIBRARY_PATH", "ROS_DISTRO")
@@ -170,7 +170,7 @@ def prepare(extras: set[str]) -> None:
             place.rename(VENV)
         if HAS_ROS:
             messages = cached(f"messages-{keys()[1]}-{site_packages().parent.name}", build_messages)
-            # What a process may use is replaced, not written into.
+            # Files that a process may use are replaced, not written into.
             subprocess.run(["cp", "-r", "--remove-destination", f"{messages}/.", VENV], check=True)
         for path in compiled():
             path.unlink()
@@ -237,7 +237,7 @@ def site_packages(place: Path = VENV) -> Path:
 
 
 def state() -> dict[str, Any]:
-    """What is done: extras, whether the packages are whole, and the digest of what all was made of."""
+    """State of the set-up: extras, whether the packages are whole, and the digest of what all was made of."""
     with suppress(OSError, ValueError):
         if (VENV / "bin/python").exists():
             return dict(json.loads((VENV / "dtsa.json").read_text(encoding="utf-8")))
@@ -327,7 +327,7 @@ def writable(variable: str, default: str) -> Path:
 
 @contextmanager
 def lock() -> Iterator[None]:
-    """One set-up at a time in this checkout. What a killed one has left running holds the lock, too, until it ends."""
+    """One set-up at a time in this checkout. Processes that a killed one left hold the lock, too, until they end."""
     LOGS.mkdir(exist_ok=True)
     with (LOGS / "lock").open("w") as file:
         os.set_inheritable(file.fileno(), True)

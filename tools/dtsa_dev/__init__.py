@@ -1,1 +1,1 @@
-"""What only developers of this project run: soaks, proofs, experiments with the protocol alone, benchmarks."""
+"""Tools that only developers of this project run: soaks, proofs, experiments with the protocol alone, benchmarks."""

@@ -44,7 +44,7 @@ class EmbeddedFlight:
 
 @dataclass(frozen=True, slots=True)
 class BoardCosts:
-    """What one policy costs the app; instructions by kind of turn: mean, most."""
+    """Costs of one policy in the app; instructions by kind of turn: mean, most."""
 
     policy: str
     agents: int
@@ -84,7 +84,7 @@ of docs/how-to/on-board.md runs there instead, with 12 and 20 agents: what a slo
 
 
 def _measure_library(directory: Path) -> tuple[list[str], list[list[str]], str]:
-    """What `dtsa embedded` shows: heads, rows, sizes."""
+    """The table of `dtsa embedded`: heads, rows, sizes."""
     here, cortex = fly_here(directory), fly_on_cortex(directory)
     rows = []
     for flight, other in zip(cortex, here, strict=True):
@@ -102,7 +102,7 @@ def _measure_library(directory: Path) -> tuple[list[str], list[list[str]], str]:
 
 
 def _measure_board(directory: Path) -> tuple[list[str], list[list[str]], str]:
-    """What `dtsa embedded --board` shows: heads, rows, sizes."""
+    """The table of `dtsa embedded --board`: heads, rows, sizes."""
     from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, TURN_NS, on_air_ns
     from dtsa_channel_sim.model.airtime import airtime_of
 
@@ -195,7 +195,7 @@ def _compiler() -> str:
 
 
 def _run_on_cortex(directory: Path, files: list[Path], flags: list[str], metered: bool) -> str:
-    """What a program prints in QEMU."""
+    """Output of a program in QEMU."""
     qemu = tool("qemu-system-arm", "qemu-system-arm")
     board = ["-nostartfiles", "--specs=rdimon.specs", f"-T{HERE / 'mps2.ld'}", *IN_PARTS]
     program = compile_program(_compiler(), directory / "board.elf", [*files, HERE / "mps2.c"], [*flags, *board])

@@ -31,7 +31,7 @@ _DECLARED = (
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """What happens in an exploration; M and S are small, because they only set time scales."""
+    """Events of an exploration; M and S are small, because they only set time scales."""
 
     name: str
     agents: int
@@ -55,7 +55,7 @@ class Scope:
 
 @dataclass(frozen=True, slots=True)
 class Exploration:
-    """What an exploration found."""
+    """Result of an exploration."""
 
     scope: Scope
     broken: str  # the rule; empty: all hold in all states that were reached

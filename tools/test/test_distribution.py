@@ -22,7 +22,7 @@ import checkout
 import dtsa_bench
 from dtsa_agent.core.errors import ConfigError
 
-# What the tests' environment has of ROS must not be found from the fresh one.
+# ROS of the tests' environment must not be found from the fresh one.
 HIDDEN = "import sys\nfor name in ('rclpy', 'ament_index_python', 'dtsa_msgs'):\n    sys.modules[name] = None\n"
 DIGEST = "import release_trial; print(release_trial.digest())"
 

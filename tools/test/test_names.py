@@ -43,7 +43,7 @@ BANNED = {
         ("a participle leaves out what it is said of", "a noun of the field with its role"),
     ),
 }
-#: What no class may end with: its last word is the noun.
+#: Words that no class may end with: its last word is the noun.
 BANNED_AS_NOUNS = {
     **dict.fromkeys(
         ("heard", "sent", "given", "made", "found", "known", "kept", "gone"),

@@ -85,11 +85,10 @@ def plot_distances(*flights: FlightLog, titles: Sequence[str] | None = None, ax:
     :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: without a flight, or for a number of titles that does not fit.
     """
-    figure, axis = _plot_over_time(
-        flights, titles, ax, "smallest distance [m]", lambda flight: flight.distances.set_index("time_s")["distance_m"]
+    title = "smallest distance [m]"
+    return _plot_over_time(
+        flights, titles, ax, title, lambda flight: flight.distances.set_index("time_s")["distance_m"], crash=True
     )
-    axis.axhline(flights[0].config.limits.collision_m, color=QUIET, linewidth=1, linestyle=":")
-    return figure
 
 
 def plot_ages(*flights: FlightLog, titles: Sequence[str] | None = None, ax: Panels = None) -> Figure:
@@ -102,7 +101,7 @@ def plot_ages(*flights: FlightLog, titles: Sequence[str] | None = None, ax: Pane
     """
     return _plot_over_time(
         flights, titles, ax, "mean age [slots]", lambda flight: flight.ages.groupby("time_s")["age_slots"].mean()
-    )[0]
+    )
 
 
 def _plot_over_time(
@@ -111,18 +110,22 @@ def _plot_over_time(
     ax: Panels,
     title: str,
     series: Callable[[FlightLog], Any],
-) -> tuple[Figure, Axes]:
-    """A line a flight: its series by time, s."""
+    *,
+    crash: bool = False,
+) -> Figure:
+    """A line a flight: its series by time, s; with `crash` a dotted one where two have crashed."""
     names = _titles(flights, titles)
     with style():
         figure, (axis,) = panels(1, width=5.6, height=3.6, given=_listed(ax))
         for flight, name, shade in zip(flights, names, colours(list(range(len(flights)))), strict=True):
             values = series(flight)
             axis.plot(values.index, values.to_numpy(), color=shade, label=name)
+        if crash:  # before the limits of the axis are fixed, so that it is always within them
+            axis.axhline(flights[0].config.limits.collision_m, color=QUIET, linewidth=1, linestyle=":")
         axis.set(title=title, xlabel="time [s]", ylim=(0, None))
         if len(flights) > 1:
             axis.legend()
-    return figure, axis
+    return figure
 
 
 def plot_bars(

@@ -56,7 +56,7 @@ def _processes(context: LaunchContext) -> list:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """What ``ros2 launch`` asks for."""
+    """Arguments and processes, for ``ros2 launch``."""
     yes_no = ["true", "false"]
     arguments = [
         DeclareLaunchArgument(name, default_value=default, choices=choices, description=text)

@@ -39,7 +39,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """What ``ros2 launch`` asks for."""
+    """Arguments and processes, for ``ros2 launch``."""
     return LaunchDescription(
         [
             DeclareLaunchArgument("agents", default_value="12", description="number of agents"),

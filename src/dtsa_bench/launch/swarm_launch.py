@@ -94,7 +94,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """What ``ros2 launch`` asks for."""
+    """Arguments and processes, for ``ros2 launch``."""
     described = [
         DeclareLaunchArgument(prefix + s.name, default_value=UNSET, description=f"{s.description} [{s.default}]")
         for cls, prefix in SECTIONS

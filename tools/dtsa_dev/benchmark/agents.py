@@ -1,4 +1,4 @@
-"""What agents over UDP cost, beside the same agents as ROS nodes at the same time, on the same machine."""
+"""Costs of agents over UDP, beside the same agents as ROS nodes at the same time, on the same machine."""
 
 from __future__ import annotations
 

@@ -213,7 +213,7 @@ def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0
 
 
 def flights(repeats: int = 12) -> Iterator[Measurement]:
-    """Whole flights as `simulate` flies them, metrics included: the fastest of each; and what sets one up."""
+    """Whole flights as `simulate` flies them, metrics included: the fastest of each; and the time to set one up."""
     for settings, limit_s in FLIGHTS:
         best = _fastest(settings, repeats if limit_s < 1 else 2)
         what = ", ".join(f"{key} {value}" for key, value in settings.items() if key not in ("agents", "timeout_s"))

@@ -1,4 +1,4 @@
-"""What the site needs beyond pages in `docs` (hooks of MkDocs): pages and tables made from the code, other files.
+"""Parts of the site beyond the pages in `docs` (hooks of MkDocs): pages and tables made from the code, other files.
 
 A page may link to any file of the repository, as it does when it is read there. On the site README's neighbours are
 pages, other files are copied to `files/`, and a directory's name is no link.

@@ -1,7 +1,7 @@
 """The tables of a node's topics, services and parameters in the documentation, made from the node itself.
 
 Each node is started with a stop signal already given: it declares its parameters, makes its publishers, subscriptions
-and services, and ends. What it had then is what the tables show.
+and services, and ends. The tables show what it had then.
 """
 
 from __future__ import annotations

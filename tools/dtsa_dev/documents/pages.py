@@ -24,7 +24,7 @@ _GROUPS = {
     "One flight": ("simulate", "run_config", "FlightLog"),
     "Many flights": ("sweep", "SweepResult"),
     "Recorded runs": ("open", "verify", "Verification", "Difference"),
-    "What a plug-in is given": ("register", "Table", "plug_in_random"),
+    "Plug-ins": ("register", "Table", "plug_in_random"),
     "Figures": (*(name for name in dtsa.__all__ if name.startswith("plot_")), "agent_colour"),
     "One agent, one channel": ("Agent", "Decision", "SlotOutcome", "Channel", "Verdict"),
     "Settings": _SETTINGS,
@@ -46,7 +46,7 @@ def commands() -> str:
         "In a checkout a command is `tools/dtsa COMMAND`; where the distribution is installed it is `dtsa COMMAND`.\n"
         f"A checkout alone has the developers' commands: {only}. Exit codes: 0 done, 1 the command failed,\n"
         "2 wrong input, 130 interrupted. `tools/dtsa --help` also lists the commands that concern the machine.\n\n"
-        f"{table(('command', 'what it does'), rows)}\n{''.join(parts)}"
+        f"{table(('command', 'purpose'), rows)}\n{''.join(parts)}"
     )
 
 
@@ -73,8 +73,8 @@ def messages() -> str:
     """The page of messages and services: each definition with its comments."""
     parts = [
         "# Messages and services\n\n"
-        "Package `dtsa_msgs`, as `ros2 interface show` prints it. Which node publishes what, and which\n"
-        "topics a bag has: [nodes and bags](nodes.md).\n\n"
+        "Package `dtsa_msgs`, as `ros2 interface show` prints it. Topics of nodes and of bags:\n"
+        "[nodes and bags](nodes.md).\n\n"
     ]
     for path in (*sorted(_TYPES.glob("msg/*.msg")), *sorted(_TYPES.glob("srv/*.srv"))):
         text = path.read_text(encoding="utf-8").rstrip()
@@ -103,7 +103,7 @@ def _library() -> Iterator[str]:
         if "Table" in names:
             yield "The methods of each kind, with shapes, units and errors: [plug-ins](plug-ins.md).\n\n"
     yield "## An environment for learning\n\n"
-    yield "Each name is `dtsa.env.NAME`. What agents observe: [how-to](../how-to/learning.md).\n\n"
+    yield "Each name is `dtsa.env.NAME`. Observations: [how-to](../how-to/learning.md).\n\n"
     for name in dtsa.env.__all__:
         if name != "Reward":  # a type without a text of its own: what takes SlotResults
             yield _entry(f"{getattr(dtsa.env, name).__module__}.{name}", True)

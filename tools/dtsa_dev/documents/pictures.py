@@ -66,7 +66,7 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True)
 class PlayedSlot:
-    """What happened in one slot."""
+    """Events of one slot."""
 
     number: int
     senders: tuple[int, ...]  # ids
@@ -130,7 +130,7 @@ def lease() -> Drawing:
 
 
 def lost_frame() -> Drawing:
-    """What each of eight agents takes for the next sender, before and after one of them misses a frame."""
+    """The next sender by each of eight agents, before and after one of them misses a frame."""
     agents, missed, by, first, count, cell = 8, 183, 8, 182, 17, 36.0
     config = SwarmConfig(agents=agents, moving=agents, policy="dtsa", scenario="waypoints", stops=4, seed=2)
     shown = play(config, first + count, (missed, by))[0][first:]

@@ -16,7 +16,7 @@ from dtsa_channel_sim.model.airtime import RADIOS
 from . import table
 
 _AGENTS, _MOVING, _SEEDS = 12, 4, 20
-_GUARD_NS = 70_000  # docs/evidence/league.md, "Which slot length can this hardware do?"
+_GUARD_NS = 70_000  # docs/evidence/league.md, "Shortest slots of this hardware"
 _UDP_SLOT_NS = 10_000_000  # flown, on one machine and in network namespaces: no formula says what a network does
 _PATIENCE_NS = 1_000_000_000  # an agent that moves is to be heard as often
 _MOST = 254  # agents that `lease` can have

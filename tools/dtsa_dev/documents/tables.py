@@ -134,7 +134,7 @@ def _modems() -> str:
             sizes = f"{modem.packet}, {modem.buffer} bytes"
             rows.append((f"`{name}`", modem.text, *times, sizes, f"{modem.baud} baud"))
             sources.setdefault(modem.source, []).append(f"`{name}`")
-    head = ("`--modem`", "what", f"{_LENGTH} bytes on the air", "until it sends", "an empty turn",
+    head = ("`--modem`", "modem", f"{_LENGTH} bytes on the air", "until it sends", "an empty turn",
             "longest packet, buffer", "line")  # fmt: skip
     listed = "".join(f"- {', '.join(names)}: {source}.\n" for source, names in sources.items())
     return f"{table(head, rows)}\nSources:\n\n{listed}"
@@ -168,7 +168,7 @@ def _faults() -> str:
         (number, fault.what, fault.reaction, "tests and soak" if fault.sample else "soak")
         for number, fault in enumerate(FAULTS, 1)
     ]
-    return table(("", "what happens", "what the system does", "run by"), rows)
+    return table(("", "fault", "reaction", "run by"), rows)
 
 
 def evidence(name: str) -> str:
@@ -196,7 +196,7 @@ def _records() -> str:
             promise = record.get("promise", "what it costs")
             cells = (promise, record.get("passed", ""), record["date"], f"`{record['code']}`")
             rows.append((f"[{path.stem}]({path.name})", f"`tools/dtsa {record['command']}`", *cells))
-    return table(("record", "command", "what should hold", "passed", "date", "digest of the code"), rows)
+    return table(("record", "command", "promise", "passed", "date", "digest of the code"), rows)
 
 
 def _league() -> str:
@@ -218,12 +218,12 @@ def _league() -> str:
         table(HEADS, scores.lines()),
         "Age in each cell, ms; in brackets the lost flights, if any:\n",
         table(("scheme", *scores.cells), scores.cell_lines()),
-        table(("cell", "what it is"), [[name, cell["text"]] for name, cell in scores.league.cells.items()]),
+        table(("cell", "meaning"), [[name, cell["text"]] for name, cell in scores.league.cells.items()]),
         table(("entry", "sets", "package", "commit", "flown"), flown),
     ])  # fmt: skip
 
 
-#: What a page may ask for, and what makes it.
+#: Tables that a page may ask for, and their makers.
 TABLES: dict[str, Callable[[], str]] = {
     "SwarmConfig": partial(_grouped, SwarmConfig),
     "SwarmConfig, leases": partial(settings_table, SwarmConfig, ["Frames and leases"]),

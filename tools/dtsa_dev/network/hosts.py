@@ -1,8 +1,8 @@
 """Computers for trials of a real air: network namespaces, each with an address and a cable of its own.
 
 The cable is a TAP device: what a host sends on it is read here as Ethernet frames, and what is written here arrives at
-the host. Whoever holds the other ends of all cables is the switch between them. This process stays where it is; only
-while a host is made it looks in.
+the host. The process that holds the other ends of all cables is the switch between them. This process stays where it
+is; only while a host is made it looks in.
 """
 
 from __future__ import annotations

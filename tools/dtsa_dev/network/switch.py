@@ -1,6 +1,6 @@
 """The switch between the hosts of a trial: it is the channel model's medium.
 
-What a host sends is on the air for as long as its length takes; half duplex; frames that overlap at a receiver destroy
+A frame of a host is on the air for as long as its length takes; half duplex; frames that overlap at a receiver destroy
 each other there. Losses, partitions and jamming are those of the channel's settings. Delivery may be delayed, and
 doubled, by link. Everything but datagrams to the swarm's group is left out: nothing else is on the air.
 """
@@ -51,7 +51,7 @@ class CarriedDatagram:
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """What links do to frames beside the medium."""
+    """Effects of links on frames, besides those of the medium."""
 
     delay_ns: int = 0
     jitter_ns: int = 0  # more, evenly distributed
@@ -124,7 +124,7 @@ class Switch:
                 heapq.heappush(self._ends, start + self.channel.config.airtime.total_ns(len(payload)))
 
     def _payload(self, frame: bytes) -> bytes:
-        """What a datagram to the group carries; empty: it is something else."""
+        """Payload of a datagram to the group; empty: the frame is something else."""
         if len(frame) < _ETHERNET + 28 or int.from_bytes(frame[12:14], "big") != _IPV4:
             return b""
         packet = frame[_ETHERNET:]

@@ -1,4 +1,4 @@
-/* What the app on board costs: onboard/app.c runs as it is, on board mps2-an386 (see mps2.c), among
+/* Costs of the app on board: onboard/app.c runs as it is, on board mps2-an386 (see mps2.c), among
  * others that run the same station. The firmware's functions are here: they hand over what the air
  * carries, let time pass, and count instructions and stack of each turn of the app's loop.
  *

@@ -22,8 +22,8 @@ GOALS, FAR = ("go", "go", "stop", "rest"), 30.0  # m
 SHORT, LONG = 300, 1700  # slots
 FAULTS = ("die", "join", "join", "restart", "leave")
 
-# What a swarm is compared by after every slot, besides senders and frames: of agents, of tables, and estimates, which
-# a shared table has of all.
+# Compared after every slot, besides senders and frames: values of agents, of tables, and estimates, which a shared
+# table has of all.
 _OF_AGENTS = (
     "chosen", "reason", "score", "digest", "sends", "present", "position", "velocity", "command", "track",
 )  # fmt: skip

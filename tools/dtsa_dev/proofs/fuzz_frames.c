@@ -1,4 +1,4 @@
-/* Fuzzed: decoders. Whatever is decoded is encoded again and means the same. */
+/* Fuzzed: decoders. A frame that is decoded is encoded again and means the same. */
 #include <stdlib.h>
 #include <string.h>
 

@@ -1,4 +1,4 @@
-/* What a call costs: stack and instructions on a microcontroller, nothing elsewhere. */
+/* Costs of a call: stack and instructions on a microcontroller, nothing elsewhere. */
 #ifndef METER_H
 #define METER_H
 

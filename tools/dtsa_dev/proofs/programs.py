@@ -68,7 +68,7 @@ class FuzzFinding(DtsaError):
 
 @dataclass(frozen=True, slots=True)
 class Fuzzed:
-    """What a run of the fuzzer did."""
+    """Result of a run of the fuzzer."""
 
     runs: int
     covered: int  # edges of the control flow

@@ -3,7 +3,7 @@
  *
  * A state is what the agents remember and what can make a difference: who is there, in probation,
  * past an own anchor, waking (with OPEN turns only), and what is known of turns that can be leased;
- * and a ledger of what was given away in frames. What rests on ages and contents is free, in every
+ * and a ledger of what was given away in frames. All that rests on ages and contents is free, in every
  * slot and for each agent on its own, and so covers all that ages and contents can be:
  *
  *   who has something to say, and who knows that it will rest          (goals)
@@ -158,8 +158,8 @@ static int64_t take(void) { return *at++; }
 /* Turns are handed on where there is adoption, and there are OPEN turns. */
 static int hands_on(void) { return config.lease.open_every && config.lease.adoption; }
 
-/* An entry of an agent's ring. Who gave a turn away makes no difference without adoption: it was
- * its owner. */
+/* An entry of an agent's ring. Without adoption the agent that gave a turn away makes no
+ * difference: it was its owner. */
 static int entry_byte(int lessee, int issuer)
 {
     const int by = !config.lease.adoption ? 0 : issuer == LEASE_HANDED ? 7 : issuer;
@@ -301,7 +301,7 @@ static void write_given(int sender, const extended_frame *e)
          "4: gives no main anchor away, nothing beyond it");
 }
 
-/* What a frame says of turns, read without the agents' own code for it. */
+/* A frame's announcements of turns, read without the agents' own code for it. */
 static void write_down(int sender, const uint8_t *data)
 {
     extended_frame e;
@@ -346,7 +346,7 @@ static int befalls(int budget)
     return 1;
 }
 
-/* What an agent has handed on it does not know in its next life. */
+/* In its next life an agent does not know the turns that it has handed on. */
 static void forget(int k)
 {
     for (int64_t t = slot; t < slot + reach; t++) {
@@ -374,7 +374,7 @@ static void happen(int k)
     }
 }
 
-/* What a speaker believes, and how it is. */
+/* Beliefs and state of a sender. */
 static void speak(int k, uint8_t *frame)
 {
     dtsa_agent *a = agents[k];

@@ -54,7 +54,7 @@ class Wait:
 
 @dataclass(slots=True)
 class Outcome:
-    """What one run was like."""
+    """Result of one run."""
 
     slots: int = 0
     idle: int = 0
@@ -105,8 +105,8 @@ class Experiment:
         self.channel = Channel(channel or ChannelConfig(agents=config.agents, slot_ns=config.slot_ns, seed=config.seed))
         self.warmup = warmup
         self.moving: NDArray[np.bool_] = np.zeros(config.agents, dtype=np.bool_)
-        # Who moves flies a circle through its place, so that positions and velocities mean something to a protocol that
-        # looks at them; nobody avoids anybody.
+        # A mover flies a circle through its place, so that positions and velocities mean something to a protocol that
+        # looks at them; no agent avoids another one.
         self._phase = np.random.default_rng(config.seed + 1).uniform(0.0, 2.0 * np.pi, config.agents)
         self._centre = self.swarm.position[:2] - RADIUS * np.stack((np.cos(self._phase), np.sin(self._phase)))
         self.outcome = Outcome()

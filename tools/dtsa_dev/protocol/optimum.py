@@ -1,7 +1,7 @@
 """The least mean age that any schedule can give three agents, by dynamic programming, and how far greedy is from it.
 
 Three agents that all move send to each other in slots; each receiver loses a frame with probability p, whatever the
-other one does. Who decides knows all six ages. The mean cost of a policy, and of the best one, come from relative value
+other one does. The policy knows all six ages. The mean cost of a policy, and of the best one, come from relative value
 iteration over all states, with ages cut off at a cap.
 """
 

@@ -13,7 +13,7 @@ from dtsa_dev.records import EVIDENCE, load, write_record
 
 @pytest.fixture(scope="module")
 def record(request: pytest.FixtureRequest) -> Iterator[list[Any]]:
-    """What the items of a soak found. With `--evidence` its module's `summarise` makes the rows of a record of it."""
+    """Results of the items of a soak. With `--evidence` its module's `summarise` makes the rows of a record of it."""
     begun, loads = time.monotonic(), [load()]
     found: list[Any] = []
     yield found

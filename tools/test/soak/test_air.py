@@ -29,7 +29,7 @@ HELD_SLOTS = 3 * AGENTS * -(-(AGENTS - 1) // (NETWORK.peers - 1))
 FLIGHT_S, FAULT_S = 12.0, 3.0
 ON_THE_AIR: dict[str, dict[str, Any]] = {"jam": {"jam": True}, "partition": {"partition": apart(AGENTS)}}
 LINKS = Links(delay_ns=200_000, jitter_ns=500_000, double=0.1)
-#: What goes wrong in a flight, and what it does to it.
+#: Faults of a flight, and their settings.
 FAULTS = {
     "kill": "an agent's process is killed, and started again after 1 s",
     "freeze": "an agent's process stands still for 3 s", "partition": "the air is cut in two for 3 s",

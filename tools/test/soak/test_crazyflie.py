@@ -84,7 +84,7 @@ MISSIONS = [
 def test_mission(over: str, arming: str, flights: int, seed: int, tmp_path: Path, record: list[dict[str, Any]]) -> None:
     pytest.importorskip("cflib")
     options = ["--arming", arming, "--seed", str(seed), "--radio-seed", str(seed)]
-    # What follows each other without a restart of the Crazyflies must not be locked by the first one's end.
+    # Missions that follow each other without a restart of the Crazyflies must not be locked by the first one's end.
     station: dict[str, Any] = {"safety": {"emergency_watchdog": flights == 1}}
     times = []
     loop = subprocess.Popen([sys.executable, "-c", LOOP], start_new_session=True)
@@ -105,7 +105,7 @@ def test_mission(over: str, arming: str, flights: int, seed: int, tmp_path: Path
 
 @dataclass(frozen=True, slots=True)
 class VehicleFault:
-    """What happens to one vehicle, s after the take-off's begin; ``request`` is what the simulation is asked for."""
+    """A fault of one vehicle, s after the take-off's begin; ``request`` is what the simulation is asked for."""
 
     cf: int
     after_s: float

@@ -18,7 +18,7 @@ soak = pytest.mark.soak
 AGE_MARGIN = 0.10  # mean age may differ from the simulator's by this share
 FAULT_S = 6.0
 SLOW = {"v_max": 0.25, "a_max": 1.0, "radius": 0.35}  # m/s, m/s^2, m: slots are long
-#: What goes wrong in a flight, and what it does to it.
+#: Faults of a flight, and their settings.
 FAULTS = {
     "kill": "an agent's process is killed, and started again after 2 s", "partition": "the air is cut in two for 6 s",
     "unplug": "a modem is unplugged for 6 s, and is another device then",

@@ -16,7 +16,7 @@ from dtsa_bench.runs.program import program
 from .registry import COMMANDS, INTERRUPTED, Command, hint, load_command, report_missing_package
 
 PROGRAM = "dtsa"
-# What `tools/dtsa` knows besides the commands of this package; a test compares.
+# Commands of `tools/dtsa` besides those of this package; a test compares.
 CHECKOUT_COMMANDS = ("setup", "shell", "test", "ros2", "clean")
 
 
@@ -129,7 +129,7 @@ def _report_system(error: OSError) -> int:
 class CompletionCommand(Command):
     description = """\
 Prints a script for bash or zsh that completes the commands of this program, their options, and the values of
-options that have names. It asks nobody while one types; after an update it is made again."""
+options that have names. It starts no program while you type; make it again after an update."""
     examples = (
         ("bash > ~/.dtsa-completion.bash", "then, in ~/.bashrc: . ~/.dtsa-completion.bash"),
         ("zsh > ~/.zsh/_dtsa", "then, in ~/.zshrc before compinit: fpath=(~/.zsh $fpath)"),

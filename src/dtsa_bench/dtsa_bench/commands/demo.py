@@ -122,7 +122,7 @@ def _draw(steps: Any, flights: Mapping[str, FinishedFlight], directory: Path, an
 
 
 def _next_commands(directory: Path) -> list[tuple[str, str]]:
-    """What to do with the recordings."""
+    """Commands to go on with: the purpose of each, and its words."""
     return [
         ("the flight in which one is killed, as a page", f"{program()} report {directory}/killed-lease"),
         ("was every decision what the protocol says?", f"{program()} verify {directory}/two-lease"),

@@ -24,7 +24,7 @@ from dtsa_bench.runs.options import (
     given_options,
     run_config,
     whole_number,
-)  # fmt: skip
+)
 
 from .crazyflies import SIMULATED_RADIO, use_simulated_radio
 from .registry import INTERRUPTED, Command, add_rows, warn
@@ -183,7 +183,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
 
 
 def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
-    """What went wrong in a mission; empty: nothing. ``cut_short``: why the exchange was, if it was."""
+    """A mission's problem in words; empty: none. ``cut_short``: why the exchange was, if it was."""
     exchange = f"the exchange was cut short: {cut_short}" if cut_short else "the exchange is complete"
     end = f"not known to have landed: {', '.join(not_landed)}" if not_landed else "all have landed"
     return f"{exchange}; {end}" if cut_short or not_landed else ""

@@ -24,7 +24,7 @@ from dtsa_bench.experiments.league import (
     make_entry,
     read_entries,
     write_entries,
-)  # fmt: skip
+)
 from dtsa_bench.experiments.tables import aligned
 from dtsa_bench.runs.options import named_values, processes, whole_number
 from dtsa_bench.runs.program import program
@@ -88,7 +88,7 @@ what differs. `table FILE...` compares entries. How to enter: docs/how-to/sweep.
 
 
 def _cells(args: argparse.Namespace, the_league: League) -> int:
-    print(aligned([["cell", "what it is"], *([name, cell["text"]] for name, cell in the_league.cells.items())]))
+    print(aligned([["cell", "meaning"], *([name, cell["text"]] for name, cell in the_league.cells.items())]))
     print(f"\n{the_league.seed_count} seeds each\nschemes: {', '.join(the_league.entrants)}")
     return 0
 
@@ -165,8 +165,8 @@ def _table(args: argparse.Namespace, the_league: League) -> int:
 class NewPluginCommand(Command):
     description = """\
 Writes a package with a policy of your own that works: the policy, a test, a sweep that sets it against the league's
-best and the bound, and the lines that install and run it. What a policy is given and what it
-returns: docs/reference/plug-ins.md."""
+best and the bound, and the lines that install and run it. Input and output of a
+policy: docs/reference/plug-ins.md."""
     examples = (("my-policy --out plugins/my-policy", "then as its README.md says"),)
     options = (
         ("name NAME", "what the policy will be called, as in my-policy"),

@@ -57,7 +57,7 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
 
 
 def read_network_options(args: argparse.Namespace) -> tuple[PortSettings, SwarmConfig]:
-    """What carries the frames, and what all agents share, as options and file say; options go before the file."""
+    """Settings of the port and of the swarm, by options and file; options go before the file."""
     _read_file(args)
     cls = settings_class(args.air)
     specs = {setting.name: setting for setting in settings_of(cls)}
@@ -78,8 +78,8 @@ def _read_file(args: argparse.Namespace) -> None:
     path = args.swarm_file
     values = {} if path is None else _content(path)
     carriers = Setting("air", "text", None, "what carries the frames", words=AIRS)
-    args.air = args.air or carriers.check(values.pop("air", AIRS[0]), f"air in {path}")
-    values.pop("air", None)
+    air = values.pop("air", AIRS[0])
+    args.air = args.air or carriers.check(air, f"air in {path}")
     sections: dict[str, type[Settings]] = {"swarm": SwarmConfig, "port": settings_class(args.air), "own": AgentSettings}
     settings = {setting.name: (name, setting) for name, cls in sections.items() for setting in settings_of(cls)}
     for name, value in values.items():

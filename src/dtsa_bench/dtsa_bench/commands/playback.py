@@ -129,8 +129,8 @@ def keyboard() -> Iterator[Callable[[], str]]:
 class ViewCommand(Command):
     description = """\
 Shows a swarm on a page that this machine alone can open: the swarm on the ROS graph, or (--air) agents on a network or
-a radio, with their settings as for `dtsa sniff`. The address that is printed holds a random token; whoever does not
-know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
+a radio, with their settings as for `dtsa sniff`. The address that is printed holds a random token, without which
+every request is refused. A recorded run has a page of its own: `dtsa report`."""
     examples = (
         ("--domain 7", "the swarm on a ROS domain"),
         ("--air udp --interface eth0 --auth-session 41", "agents on a network; the key is in DTSA_AUTH_KEY"),

@@ -12,8 +12,6 @@ from typing import Any
 from .registry import RECORDED_RUN, Command, warn
 
 TABLES = ("slots", "frames", "receptions", "decisions", "states", "ages", "ages_by_observer", "distances")
-
-
 _SHOWN = 8  # links that lose most
 
 

@@ -19,7 +19,7 @@ _COMMANDS = {  # by name: the module, and what it does
     "agent": ("network", "one agent on a real network: frames over UDP, no channel node, no ROS"),
     "simulate": ("simulation", "one or many flights without ROS, as fast as the machine allows"),
     "sweep": ("simulation", "many simulated flights over a grid of settings; can be interrupted and resumed"),
-    "league": ("league", "cells that any policy flies, entries that anybody can check, and their table"),
+    "league": ("league", "cells that any policy flies, entries that you can check, and their table"),
     "new-plugin": ("league", "a package to begin with: a policy of your own, its test and a sweep"),
     "replay": ("playback", "play a bag back into the ROS graph"),
     "verify": ("recordings", "check a bag: was every decision what the protocol says?"),
@@ -62,7 +62,10 @@ class Command:
 
 
 def add_rows(parser: argparse._ActionsContainer, rows: Iterable[Row]) -> None:
-    """Add options: ``--flag``, ``--name VALUE`` or ``name VALUE...``, the help, and more arguments for argparse."""
+    """Add options: their words, the help, and more arguments for argparse.
+
+    Words are ``--flag``, ``--name VALUE``, ``name VALUE...`` (one or more) or ``name VALUE*`` (any number).
+    """
     for words, text, *others in rows:
         name, _, value = words.partition(" ")
         more: dict[str, Any] = {"help": text, **(others[0] if others else {})}

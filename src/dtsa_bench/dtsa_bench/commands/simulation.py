@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 class SimulateCommand(Command):
     description = """\
 Flies one run without ROS, as fast as this machine allows, over the same core as the nodes. For equal options
-and seed
-every slot has the same sender and every quadcopter the same positions as with `fly`, bit for bit."""
+and seed every slot has the same sender and every quadcopter the same positions as with `fly`, bit for bit."""
     examples = (
         ("--agents 18 --policy dtsa --loss 0.01", "one flight, its results as lines"),
         ("--moving 2 --policy lease --json", "the same as JSON"),

@@ -1,4 +1,4 @@
-"""What an object says of itself: lines for a terminal, and the same with a picture for a notebook."""
+"""Cards, by which objects describe themselves: lines for a terminal, and the same with a picture for a notebook."""
 
 from __future__ import annotations
 

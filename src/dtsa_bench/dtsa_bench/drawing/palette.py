@@ -20,7 +20,7 @@ SHAPES = ("circle", "diamond", "square", "triangle")
 HOVERING = "#98a3af"
 # Lines, bars and areas that are no agents: Okabe and Ito ("Color Universal Design", 2008).
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-# What becomes of a slot or a frame.
+# Outcome of a slot or a frame.
 SENT, COLLIDED = "#e69f00", "#dc183c"
 
 

@@ -1,6 +1,6 @@
 """The league: frozen cells that any policy flies, entries that anybody can check, and the table of all.
 
-What is frozen stands in ``league-1.yaml``; see docs/how-to/sweep.md.
+The frozen parts stand in ``league-1.yaml``; see docs/how-to/sweep.md.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FIELDS = (
     "digest",
 )  # fmt: skip
 _AGE, _LOAD = FIELDS.index("waking_age_mean_ms"), FIELDS.index("channel_load")
-#: What an entry may set: its policy, that policy's own settings, the format of its frames.
+#: Settings of an entry: its policy, that policy's own settings, the format of its frames.
 SCHEME_SETTINGS = (
     "policy", "frame", "options", "gossip", "epsilon", "selection", "boot_round", "age_cap", "return_every",
     "anchor_every", "anchor_rest", "open_every", "adoption", "depth_rate", "lease_share",
@@ -232,7 +232,7 @@ def check_entry(
 # -- scores ------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """What some flights are worth. A lost flight crashed, did not end in time or could not be flown."""
+    """Score of some flights. A lost flight crashed, did not end in time or could not be flown."""
 
     lost: Share
     crashed: int
@@ -265,7 +265,7 @@ def scores(the_league: League, flights: Mapping[str, Sequence[Sequence[Any]]]) -
 
 
 def _age_ms(flight: Sequence[Any], most: float) -> float:
-    """What counts as the age of a flight; `most` is that of a lost one, and the largest."""
+    """Age of a flight, as it counts; `most` is that of a lost one, and the largest."""
     lost = flight[0] != "completed" or flight[_AGE] is None
     return most if lost else min(most, max(_LEAST_AGE_MS, float(flight[_AGE])))
 

@@ -1,4 +1,4 @@
-"""What a paper takes from a sweep: figures, a table in LaTeX, and the numbers. Each says how it was made."""
+"""Files for a paper from a sweep: figures, a table in LaTeX, and the numbers. Each says how it was made."""
 
 from __future__ import annotations
 

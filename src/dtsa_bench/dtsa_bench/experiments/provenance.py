@@ -1,4 +1,4 @@
-"""What a measurement was made with: a digest of the code that flew, and the commit, cores, Python and date."""
+"""Provenance of a measurement: a digest of the code that flew, and the commit, cores, Python and date."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a sweep flies: a base, axes that are combined with each other, and seeds. See docs/how-to/sweep.md."""
+"""Content of a sweep: a base, axes that are combined with each other, and seeds. See docs/how-to/sweep.md."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _SECTIONS: dict[str, dict[str, Setting]] = {
 
 @dataclass(frozen=True, slots=True)
 class SweepSpec(Settings):
-    """What a sweep's YAML file says.
+    """Content of a sweep's YAML file.
 
     :raises ConfigError: naming what is not usable.
     """

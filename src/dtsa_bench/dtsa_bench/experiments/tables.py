@@ -232,7 +232,7 @@ def markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 
 def table_text(table: SweepTable, width: int = 0, shown: Sequence[str] = SHOWN, most: int | None = None) -> str:
-    """Return one line a group: crashes and means with their 95 % intervals. What is too wide goes on below.
+    """Return one line a group: crashes and means with their 95 % intervals. A table that is too wide goes on below.
 
     `width` is in characters, 0: as many as it takes; at most `most` groups are shown.
     """

@@ -15,7 +15,7 @@ LOCKSTEP, REALTIME = MODES = ("lockstep", "realtime")
 
 @dataclass(frozen=True, slots=True, repr=False)
 class RunLimits(Settings):
-    """What ends a run, and what counts as a crash."""
+    """Limits that end a run, and the distance that counts as a crash."""
 
     timeout_s: float = setting(
         60.0, "a run that is not complete by then ends and is counted apart", unit="s", minimum=0.01, maximum=86400

@@ -1,4 +1,4 @@
-"""What a flight was worth: the one definition of all results, for `simulate`, `fly`, `sweep` and `verify`.
+"""Figures of merit of a flight: the one definition of all results, for `simulate`, `fly`, `sweep` and `verify`.
 
 Times are those of slot ends, counted from the start of slot 0. Distances and paths are true ones, at every control
 instant. Ages and estimate errors are taken at every slot's end from that of slot N - 1 on, with which a boot round is
@@ -222,7 +222,7 @@ class FlightMetrics:
     def summary(self, wall_time_s: float | None = None) -> dict[str, Any]:
         """The results as plain values, with the wall-clock time that the flight took, s.
 
-        What does not exist (no movers, not complete, ...) is None.
+        A figure that does not exist (no movers, not complete, ...) is None.
         """
         swarm, sums = self.run.swarm, self.kernel
         flown = self.slots * swarm.slot_ns / 1e9

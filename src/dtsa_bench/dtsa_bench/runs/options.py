@@ -128,7 +128,7 @@ def processes(text: str | None) -> int | None:
 
 
 def named_values(words: Iterable[str]) -> dict[str, Any]:
-    """What `--set NAME=VALUE` says, by name, with underscores; values are YAML.
+    """Values of `--set NAME=VALUE` by name, with underscores; values are YAML.
 
     :raises ConfigError: for one that is none.
     """

@@ -1,4 +1,4 @@
-"""What the command line is called: `tools/dtsa` in a checkout, `dtsa` where it has been installed."""
+"""Name of the command line: `tools/dtsa` in a checkout, `dtsa` where it has been installed."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ import os
 
 
 def program() -> str:
-    """What stands in front of a command that a message names; `tools/dtsa` says it in the environment."""
+    """Words in front of a command that a message names; `tools/dtsa` says it in the environment."""
     return os.environ.get("DTSA_PROGRAM", "dtsa")

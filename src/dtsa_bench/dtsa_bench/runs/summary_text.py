@@ -33,14 +33,12 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 def setting_rows(run: RunConfig) -> list[tuple[str, str]]:
     """All settings of a run as rows of name and text, those of swarm, channel and limits one after the other."""
     sections: tuple[tuple[str, Settings], ...] = (("swarm", run.swarm), ("channel", run.air), ("limits", run.limits))
-    return [
-        (
-            f"{section}.{spec.name}",
-            _short(getattr(settings, spec.name)) + f" {spec.unit}" * (spec.unit not in ("", "1")),
-        )
-        for section, settings in sections
-        for spec in settings_of(type(settings))
-    ]
+    rows = []
+    for section, settings in sections:
+        for spec in settings_of(type(settings)):
+            unit = "" if spec.unit in ("", "1") else f" {spec.unit}"
+            rows.append((f"{section}.{spec.name}", _short(getattr(settings, spec.name)) + unit))
+    return rows
 
 
 def what_flew(run: RunConfig) -> str:

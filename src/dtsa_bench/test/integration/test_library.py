@@ -214,6 +214,8 @@ def test_plots_are_figures_of_what_they_are_given(flight: dtsa.FlightLog, swept:
     assert [axis.get_title(loc="left") for axis in paths.axes] == ["simulated", "recorded"]
     distances = dtsa.plot_distances(flight).axes[0].lines[0]
     assert min(distances.get_ydata()) == pytest.approx(flight.summary["min_distance_m"], abs=0.01)
+    near = dtsa.simulate(agents=2, collision_m=9.0, stop_on_crash=False)
+    assert dtsa.plot_distances(near).axes[0].get_ylim()[1] > 9.0  # the line of a crash is in sight
     for figure in (
         dtsa.plot_ages(recording),
         dtsa.plot_lines(swept, x="loss", y=["age_mean_slots", "crashed"], series="scheme"),
