@@ -189,10 +189,13 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
         if not 0.0 < args.seconds <= 1e6:
             raise ConfigError("seconds", args.seconds, "more than 0, up to 1000000")
         settings = LabSettings(**given_options(args, LabSettings, "lab"))
-        try:
-            parameters = parse_values(",".join(args.set))
-        except ValueError:
-            raise ConfigError("set", ", ".join(args.set), "GROUP.NAME=NUMBER") from None
+        parameters = {}
+        for text in args.set:
+            try:
+                ((name, value),) = parse_values(text).items()
+            except ValueError:
+                raise ConfigError("set", text, "GROUP.NAME=NUMBER") from None
+            parameters[name] = value
         out = None if args.out is None else new_directory(args.out)
         swarm, place = None, args.app
         of_protocol = {name: getattr(args, name) for name in _OF_PROTOCOL if getattr(args, name) is not None}

@@ -213,6 +213,8 @@ def test_the_command_flies_the_protocol_and_says_what_cannot_be(tmp_path, capsys
         (["beacons", "--slot-ms", "5"], "slot_ms: got '5'; allowed: only with protocol"),
         (["protocol", "--auth-session", "7"], "DTSA_AUTH_KEY: got ''"),
         (["protocol", "--auth-session", "0"], "auth_session: got 0"),
+        (["beacons", "--set", "a.b=1,a.c=2"], "set: got 'a.b=1,a.c=2'; allowed: GROUP.NAME=NUMBER"),
+        (["beacons", "--set", "a.b=1", "--set", ""], "set: got ''; allowed: GROUP.NAME=NUMBER"),
     ):
         assert main(["peer-lab", *words]) == 2
         assert said in capsys.readouterr().err
