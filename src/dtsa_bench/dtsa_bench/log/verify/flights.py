@@ -123,9 +123,7 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
 
     :raises Mismatch: at the first difference.
     """
-    own_clocks = result.mode == REALTIME
-    log.settings = {**log.settings, "mode": REALTIME}  # missions say what they fly with instead of a mode
-    run = log.config
+    run, own_clocks = log.config, result.mode == REALTIME
     frames, authenticator = FramesOnAir.of_log(log, run.air, own_clocks), None
     if run.swarm.auth:
         if key := os.environ.get(VARIABLE, ""):
