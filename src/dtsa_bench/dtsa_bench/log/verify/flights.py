@@ -143,6 +143,7 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
         result.count("summary.json")
     if own_clocks and (run.air.range_m or run.air.capture_db):
         result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
+        frames.check_numbers()
         if not run.air.airtime.line.serial:
             frames.check_overlaps()
             result.count("frames that no agent received together", len(frames.slot))
