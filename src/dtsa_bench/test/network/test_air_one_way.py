@@ -19,7 +19,7 @@ from dtsa_bench.log.agent_bag import AgentBag, AgentRecorder, NothingWritten, re
 from dtsa_bench.log.arrays import split_log
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merge.timeline import Crossings, both_ways, fit
-from dtsa_bench.log.merged_flight import count_unmatched_frames, slots_until_all_known
+from dtsa_bench.log.merged_flight import MergedReplay, slots_until_all_known
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
 
@@ -115,10 +115,12 @@ def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: 
     later = read(bags[1])
     later.log = split_log(later.log, later.log.first_slot + len(later.log) // 2)
     log = Merge([read(bags[0]), later]).log
-    assert count_unmatched_frames(log) > 0
+    assert MergedReplay(log).count_unmatched_frames() > 0
     for agents, is_right in (([2], True), ([1], False)):
         log.merged["agents_that_gave_up_a_time"] = agents
-        assert (count_unmatched_frames(log) == 0) == is_right
+        assert (MergedReplay(log).count_unmatched_frames() == 0) == is_right
+    log.merged["count"] = 9  # of a bag from elsewhere
+    assert "Merged from 2 agents' bags." in MergedReplay(log).run().notes[0]
 
 
 def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:

@@ -19,7 +19,7 @@ from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.flight_log import log_of_flight
 from dtsa_bench.log.merge.merge import clocks_apart, receptions_of
-from dtsa_bench.log.merged_flight import MergedReplay, check_rules, count_unmatched_frames
+from dtsa_bench.log.merged_flight import MergedReplay, check_rules
 from dtsa_bench.log.replay import AgentReplay
 from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.config import REALTIME
@@ -270,7 +270,7 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     if first := next((one for process in replay.processes for one in process.replay.differences), None):
         raise decision_difference(first, log, "follows from what the agent says to have heard")
     result.count("decisions made again", replay.equal)
-    if others := about["frames_heard_not_as_sent"] + count_unmatched_frames(log):
+    if others := about["frames_heard_not_as_sent"] + replay.count_unmatched_frames():
         why = "no agent hears a frame that was not sent"
         raise Mismatch("frames heard", "as they were sent", f"{others} others", why)
     if apart := about["not_determined"]:
