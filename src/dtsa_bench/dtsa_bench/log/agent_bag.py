@@ -342,7 +342,7 @@ class _Reader:
                 self.custom |= custom if AGENT in custom else {}
             elif isinstance(record, Message) and record.channel_id == self._channel and self.custom:
                 self._add_message(record)
-        except NOT_OF_ITS_TYPE:
+        except (*NOT_OF_ITS_TYPE, AttributeError):  # the latter of one whose definition has other fields
             return False
         return True
 

@@ -24,6 +24,7 @@ from .flight_log import FlightLog
 
 SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
 CONFIGURATION = "dtsa_msgs/msg/Configuration"
+_HEADER = "std_msgs/msg/Header"
 FORMAT, FORMAT_KEY = "2", "format"  # of bags, and its name in custom data
 AGENT, SNIFFER = "agent", "sniffer"  # custom data: what the record of one agent, or of a listener, says of itself
 _OF_FORMAT_1 = {f"{names.SWARM}/{topic}" for topic in (names.RECEPTION, names.TRANSMISSION, names.DECISION)}
@@ -47,7 +48,7 @@ def _store() -> Any:
 
 def _header(time_ns: int) -> Any:
     stamp = _store().types["builtin_interfaces/msg/Time"](*divmod(time_ns, _SECOND))
-    return _store().types["std_msgs/msg/Header"](stamp, names.FRAME)
+    return _store().types[_HEADER](stamp, names.FRAME)
 
 
 def pack_configuration(run: int, settings: Mapping[str, Any]) -> bytes:
@@ -97,11 +98,16 @@ def load_log(source: Bag | str | Path) -> FlightLog:
 
 
 def check_format(bag: Bag) -> None:
-    """Whether a bag holds slot records.
+    """Whether a bag holds slot records, with the fields that they have here.
 
     :raises UnusableBag: if it does not.
     """
-    if SLOT_RECORD in bag.topics:
+    if topic := bag.topics.get(SLOT_RECORD):
+        bag.register(topic)
+        for kind, found in ((TYPE, topic.type), (_HEADER, _HEADER)):
+            (_, ours), (_, theirs) = _store().fielddefs[kind], bag.typestore.fielddefs.get(found, ((), ()))
+            if not dict(ours).items() <= dict(theirs).items():
+                raise UnusableBag(bag.given, f"{SLOT_RECORD} is {topic.type}, without fields of this version's {kind}")
         return
     if _OF_FORMAT_1 & set(bag.topics):
         raise UnusableBag(bag.given, f"it has bag format 1, and this version reads format {FORMAT}: record it again")

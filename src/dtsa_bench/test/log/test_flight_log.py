@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -10,14 +12,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from bag_helpers import definition, flight_bag
+from bag_helpers import SECOND, definition, flight_bag
 
 import dtsa
+from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.writer import BagWriter
-from dtsa_bench.log.record import SLOT_RECORD, TYPE, load_log
+from dtsa_bench.log.record import AGENT, SLOT_RECORD, TYPE, load_log, pack_record
 from dtsa_bench.log.tables import COLUMNS, table
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.runs.config import RunConfig
@@ -127,3 +130,23 @@ def test_control_instants_are_those_of_the_configuration(bag: Path, tmp_path: Pa
     difference = verify_bag(rewritten(bag, tmp_path / "twice", twice)).difference
     assert difference is not None
     assert (difference.what, difference.slot) == ("slot record, steps", 0)
+
+
+@pytest.mark.parametrize(("kind", "old", "new"), [
+    ("std_msgs/msg/String", "", ""), (TYPE, "uint8 outcome", "uint8 result"), (TYPE, "string frame_id", "string frame"),
+    (TYPE, "float64[] score", "float32[] score"), (TYPE, "uint16[] agent", "uint16[] who"),
+])  # fmt: skip
+def test_records_of_another_type_are_refused_in_one_line(tmp_path, capsys, kind, old, new):
+    theirs, settings = definition(kind), RunConfig(SwarmConfig(agents=3)).to_dict()
+    for name, custom in (("bag", {}), ("cf1.mcap", {AGENT: json.dumps({"id": 1})})):
+        with BagWriter(tmp_path / name, settings, custom_data=custom) as writer:
+            changed = dataclasses.replace(theirs, text=theirs.text.replace(old, new))
+            channel = writer.add_topic(SLOT_RECORD, kind, "reliable", changed)
+            writer.write(channel, pack_record(1, 0, SECOND, 1), SECOND, SECOND)
+    for command in ("verify", "report", "export"):
+        assert main([command, str(tmp_path / "bag")]) == 2
+        said = capsys.readouterr().err
+        assert f"{SLOT_RECORD} is {kind}, without fields" in said
+        assert said.count("\n") == 1
+    assert main(["merge", str(tmp_path / "cf1.mcap")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
