@@ -56,6 +56,7 @@ if TYPE_CHECKING:
 SUMMARY = "summary"  # name in custom data
 _CHUNK = 1 << 18  # bytes
 _AT_A_TIME = 8  # slots: several at a time take half as long
+_MOST_NS = 1 << 58  # of a clock, nine years: sums and differences of times fit into 64 bits
 _NAME = re.compile(r"cf\d+\.mcap")
 
 
@@ -309,7 +310,7 @@ def read(path: str | Path) -> AgentBag:
         raise UnusableBag(file, "a message was changed, left out, added or moved after the recording")
     try:
         bag = _make_bag(file, reader.custom, reader.records)
-    except (ConfigError, LookupError, ValueError, TypeError, AttributeError) as error:
+    except (ConfigError, LookupError, ValueError, TypeError, AttributeError, OverflowError) as error:
         raise UnusableBag(file, f"what it says of its agent cannot be read ({error})") from None
     bag.broken_off = bag.broken_off or not is_finished
     if scan.is_finished or scan.is_closed:
@@ -341,7 +342,7 @@ class _Reader:
                 self.custom |= custom if AGENT in custom else {}
             elif isinstance(record, Message) and record.channel_id == self._channel and self.custom:
                 self._add_message(record)
-        except NOT_OF_ITS_TYPE:
+        except (*NOT_OF_ITS_TYPE, AttributeError):  # the latter of one whose definition has other fields
             return False
         return True
 
@@ -378,8 +379,16 @@ def _make_bag(file: Path, custom: dict[str, str], records: Sequence[Any]) -> Age
     ]
     for log in logs:
         assert log.heard is not None
+        assert log.sent_ns is not None
+        if len(log) and log.track.shape[1] != swarm.steps:
+            raise ValueError(f"{log.track.shape[1]} control instants a slot, not {swarm.steps}")
         log.start_ns += zero_ns
         log.heard.time_ns[:] += zero_ns
+        times_ns = np.concatenate(
+            (np.array([started_ns], np.int64), log.start_ns, log.sent_ns[:, 0], log.heard.time_ns)
+        )
+        if times_ns.min() < -_MOST_NS or times_ns.max() > _MOST_NS:
+            raise ValueError(f"times beyond {_MOST_NS} ns")
         if not (1 <= agent <= swarm.agents and np.isin(log.heard.sender, range(1, swarm.agents + 1)).all()):
             raise ValueError(f"ids of agents that are not among {swarm.agents}")
     refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})

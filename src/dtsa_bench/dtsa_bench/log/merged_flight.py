@@ -176,6 +176,24 @@ class MergedReplay:
         """Frames that were made and not sent, by slot and agent."""
         return {key: data for process in self.processes for key, data in process.replay.unsent.items()}
 
+    def count_unmatched_frames(self) -> int:
+        """How many frames were heard that their sender's bag does not have, or has otherwise."""
+        about, whole = self._log.merged or {}, self._whole
+        if whole.heard is None:
+            return 0
+        complete: set[int] = set()  # agents of whom all that they sent is there
+        if not about["nothing_written"] and not about["not_on_the_time_line"]:
+            complete = {process.agent for process in self.processes}
+            complete -= {process.agent for process in self.processes if process.is_broken_off}
+        count, gave_up = 0, about.get("agents_that_gave_up_a_time", ())
+        columns = whole.heard.slot.tolist(), whole.heard.sender.tolist(), whole.heard.data
+        for slot, sender, data in zip(*columns, strict=True):
+            row = slot - whole.first_slot
+            is_recorded = 0 <= row < len(whole) and 0 < sender <= whole.agents and whole.known[row, sender - 1]
+            sent = whole.frame(row, sender) if is_recorded else b""
+            count += (sent != data if sent else sender in complete) and sender not in gave_up
+        return count
+
     def run(self) -> MergedReplay:
         """Replay all slots."""
         for _ in self:
@@ -243,7 +261,8 @@ class MergedReplay:
     def notes(self) -> list[str]:
         """What to know of the flight, once it has been replayed."""
         about = self._log.merged or {}
-        notes = [_MERGED.format(count=len(about["processes"]), **about, **about["residual_us"])]
+        numbers = {name: about["residual_us"][name] for name in ("p50", "p99")}
+        notes = [_MERGED.format(count=len(about["processes"]), common_slot=about["common_slot"], **numbers)]
         for key, text in _LEFT_OUT.items():
             if about.get(key):
                 named = ", ".join(f"cf{one}" if isinstance(one, int) else str(one) for one in about[key])
@@ -305,22 +324,3 @@ def check_rules(log: FlightArrays, unsent: Mapping[tuple[int, int], bytes]) -> R
         if frames or slot in by_slot:
             rules.check_slot(slot, frames, by_slot.get(slot))
     return rules
-
-
-def count_unmatched_frames(log: FlightArrays) -> int:
-    """How many frames were heard that their sender's bag does not have, or has otherwise."""
-    about, whole = log.merged or {}, log.whole or log
-    if whole.heard is None:
-        return 0
-    complete: set[int] = set()  # agents of whom all that they sent is there
-    if not about["nothing_written"] and not about["not_on_the_time_line"]:
-        complete = {one["agent"] for one in about["processes"]}
-        complete -= {one["agent"] for one in about["processes"] if one["broken_off"]}
-    count, gave_up = 0, about.get("agents_that_gave_up_a_time", ())
-    columns = whole.heard.slot.tolist(), whole.heard.sender.tolist(), whole.heard.data
-    for slot, sender, data in zip(*columns, strict=True):
-        row = slot - whole.first_slot
-        is_recorded = 0 <= row < len(whole) and 0 < sender <= whole.agents and whole.known[row, sender - 1]
-        sent = whole.frame(row, sender) if is_recorded else b""
-        count += (sent != data if sent else sender in complete) and sender not in gave_up
-    return count

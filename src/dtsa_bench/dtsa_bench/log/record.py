@@ -24,6 +24,7 @@ from .flight_log import FlightLog
 
 SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
 CONFIGURATION = "dtsa_msgs/msg/Configuration"
+_HEADER = "std_msgs/msg/Header"
 FORMAT, FORMAT_KEY = "2", "format"  # of bags, and its name in custom data
 AGENT, SNIFFER = "agent", "sniffer"  # custom data: what the record of one agent, or of a listener, says of itself
 _OF_FORMAT_1 = {f"{names.SWARM}/{topic}" for topic in (names.RECEPTION, names.TRANSMISSION, names.DECISION)}
@@ -47,7 +48,7 @@ def _store() -> Any:
 
 def _header(time_ns: int) -> Any:
     stamp = _store().types["builtin_interfaces/msg/Time"](*divmod(time_ns, _SECOND))
-    return _store().types["std_msgs/msg/Header"](stamp, names.FRAME)
+    return _store().types[_HEADER](stamp, names.FRAME)
 
 
 def pack_configuration(run: int, settings: Mapping[str, Any]) -> bytes:
@@ -97,11 +98,16 @@ def load_log(source: Bag | str | Path) -> FlightLog:
 
 
 def check_format(bag: Bag) -> None:
-    """Whether a bag holds slot records.
+    """Whether a bag holds slot records, with the fields that they have here.
 
     :raises UnusableBag: if it does not.
     """
-    if SLOT_RECORD in bag.topics:
+    if topic := bag.topics.get(SLOT_RECORD):
+        bag.register(topic)
+        for kind, found in ((TYPE, topic.type), (_HEADER, _HEADER)):
+            (_, ours), (_, theirs) = _store().fielddefs[kind], bag.typestore.fielddefs.get(found, ((), ()))
+            if not dict(ours).items() <= dict(theirs).items():
+                raise UnusableBag(bag.given, f"{SLOT_RECORD} is {topic.type}, without fields of this version's {kind}")
         return
     if _OF_FORMAT_1 & set(bag.topics):
         raise UnusableBag(bag.given, f"it has bag format 1, and this version reads format {FORMAT}: record it again")
@@ -198,18 +204,21 @@ def make_log(
         if len(columns):
             _fill(arrays, record, _BY_SENDER, row, columns)
             data = split_frames(record.data, record.length.tolist())
-            masks = _unpack_mask(record.received, len(columns), agents)
+            masks = np.zeros((len(columns), agents), np.uint8)
+            if len(record.received):  # else it is not known
+                masks = unpack_received(record.received.tobytes(), len(columns), agents)
             for column, sent, mask in zip(columns.tolist(), data, masks, strict=True):
                 if not sent:
                     raise ValueError(f"slot {slot}: an empty frame of cf{column + 1}")
                 frames[row, column + 1] = sent, mask
         if count := len(record.heard_sender):
             before = record.heard_before if len(record.heard_before) else np.zeros(count, np.uint8)
-            times_ns, by = record.heard_ns + arrays["start_ns"][row], _unpack_mask(record.heard_by, count, agents)
+            times_ns = record.heard_ns + arrays["start_ns"][row]
+            by = unpack_received(record.heard_by.tobytes(), count, agents)
             heard.append((np.full(count, row), record.heard_sender, record.heard_slot, times_ns, by, before))
-            lengths = record.heard_length.tolist()
-            heard_data += split_frames(record.heard_data, lengths) if lengths else [b""] * count
-            if {len(values) for values in heard[-1]} != {count}:
+            lengths = record.heard_length.tolist() or [0] * count
+            heard_data += split_frames(record.heard_data, lengths)
+            if {len(values) for values in (*heard[-1], lengths)} != {count}:
                 raise ValueError(f"slot {slot}: frames that were heard")
     keys = sorted(frames)
     received = np.array([frames[key][1] for key in keys], np.bool_).reshape(len(keys), agents)
@@ -243,11 +252,6 @@ def _fill(arrays: dict[str, Any], record: Any, fields: Sequence[str], row: int, 
         if len(values) or name not in _MAY_BE_EMPTY:
             at = slice(None) if len(columns) == target.shape[-1] else columns  # of all agents, which is faster
             target[..., at] = values.reshape(*target.shape[:-1], len(columns))
-
-
-def _unpack_mask(data: NDArray[np.uint8], count: int, agents: int) -> NDArray[np.uint8]:
-    """The mask (count, agents) of a field with a bit an agent; no bits set where it is empty."""
-    return unpack_received(data.tobytes(), count, agents) if len(data) else np.zeros((count, agents), np.uint8)
 
 
 def _received_frames(

@@ -85,6 +85,16 @@ def test_two_frames_at_one_time_are_never_both_heard() -> None:
             sent_frames(config, heard).check_overlaps()
 
 
+def test_each_receiver_counts_once_and_a_sender_not_at_all() -> None:
+    config = ChannelConfig(agents=3)
+    for received, lost, collided, what in (
+        ([False, True, True], 0, 0, ""), ([False, True, False], 1, 0, ""), ([True, False, False], 0, 0, "hears itself"),
+        ([False, True, True], 1, 0, "counts once"), ([False, False, True], 1, 1, "counts once"),
+    ):  # fmt: skip
+        with pytest.raises(Mismatch, match=what) if what else nullcontext():
+            sent_frames(config, [(1, 0, 24, received, lost, collided)]).check_numbers()
+
+
 def test_spread_and_lateness_come_from_the_right_agents() -> None:
     statistics = TimingStatistics(3)
 

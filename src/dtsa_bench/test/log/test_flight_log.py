@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import pickle
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from bag_helpers import definition, flight_bag
+from bag_helpers import SECOND, definition, flight_bag
 
 import dtsa
+from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.bag.errors import UnusableBag
+from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.writer import BagWriter
-from dtsa_bench.log.record import load_log
+from dtsa_bench.log.record import AGENT, SLOT_RECORD, TYPE, load_log, pack_record
 from dtsa_bench.log.tables import COLUMNS, table
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.runs.config import RunConfig
@@ -73,22 +79,74 @@ def test_bags_of_format_1_are_refused_in_one_line(tmp_path: Path, capsys: pytest
         assert said.count("\n") == 1
 
 
-def test_records_that_do_not_fit_together_are_one_line(bag: Path, tmp_path: Path) -> None:
-    from dtsa_bench.log.bag.reader import Bag
-    from dtsa_bench.log.record import SLOT_RECORD, TYPE
+def rewritten(bag: Path, target: Path, change: Callable[[Any], dict[str, Any]]) -> Path:
+    """A bag with the slot records of another one, in which some fields are others."""
+    with Bag(bag) as source, BagWriter(target, source.config) as copy:
+        channel = copy.add_topic(SLOT_RECORD, TYPE, "reliable", definition(TYPE))
+        for message, record in source.typed([SLOT_RECORD]):
+            for name, value in change(record).items():
+                old = getattr(record, name)
+                setattr(record, name, np.ascontiguousarray(value, old.dtype) if isinstance(old, np.ndarray) else value)
+            data = bytes(source.typestore.serialize_cdr(record, TYPE))
+            copy.write(channel, data, message.log_time_ns, message.publish_time_ns)
+    return target
 
-    def rewritten(name: str, change: str) -> Path:
-        with Bag(bag) as source, BagWriter(tmp_path / name, source.config) as copy:
-            channel = copy.add_topic(SLOT_RECORD, TYPE, "reliable", definition(TYPE))
-            for message, record in source.typed([SLOT_RECORD]):
-                if int(record.slot) == 70:
-                    value = {"slot": 2**31, "agent": record.agent[::-1].copy(), "score": record.score[1:]}[change]
-                    setattr(record, change, value)
-                data = bytes(source.typestore.serialize_cdr(record, TYPE))
-                copy.write(channel, data, message.log_time_ns, message.publish_time_ns)
-        return tmp_path / name
 
-    for change in ("slot", "agent", "score"):
-        with pytest.raises(UnusableBag, match="do not fit together") as caught:
-            load_log(rewritten(change, change))
-        assert "\n" not in str(caught.value)
+def heard(count: int, **more: Any) -> dict[str, Any]:
+    """The fields of frames of agent 1 that agent 2 heard."""
+    entries = {"sender": [1] * count, "slot": [0] * count, "ns": [0] * count, "by": [2] * count}
+    return {f"heard_{name}": values for name, values in (entries | more).items()}
+
+
+CHANGES: dict[str, dict[int, Callable[[Any], dict[str, Any]]]] = {
+    "a number": {70: lambda _: {"slot": 2**31}},
+    "the order of agents": {70: lambda record: {"agent": record.agent[::-1]}},
+    "too few entries": {70: lambda record: {"score": record.score[1:]}},
+    "no receivers": {70: lambda _: heard(1, by=[])},
+    # Together they have as many lengths as frames.
+    "lengths of frames": {
+        70: lambda _: heard(1, length=[1, 1], data=[7, 7]), 71: lambda _: heard(2, length=[1], data=[7]),
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_records_that_do_not_fit_together_are_one_line(bag: Path, tmp_path: Path, what: str) -> None:
+    changes = CHANGES[what]
+    changed = rewritten(bag, tmp_path / "bag", lambda r: changes[r.slot](r) if r.slot in changes else {})
+    with pytest.raises(UnusableBag, match="do not fit together") as caught:
+        load_log(changed)
+    assert "\n" not in str(caught.value)
+
+
+def test_control_instants_are_those_of_the_configuration(bag: Path, tmp_path: Path) -> None:
+    def twice(record: Any) -> dict[str, Any]:
+        return {
+            "steps": 2 * record.steps,
+            "track": np.repeat(record.track.reshape(record.steps, -1), 2, axis=0).ravel(),
+        }
+
+    assert verify_bag(rewritten(bag, tmp_path / "same", lambda _: {})).ok
+    difference = verify_bag(rewritten(bag, tmp_path / "twice", twice)).difference
+    assert difference is not None
+    assert (difference.what, difference.slot) == ("slot record, steps", 0)
+
+
+@pytest.mark.parametrize(("kind", "old", "new"), [
+    ("std_msgs/msg/String", "", ""), (TYPE, "uint8 outcome", "uint8 result"), (TYPE, "string frame_id", "string frame"),
+    (TYPE, "float64[] score", "float32[] score"), (TYPE, "uint16[] agent", "uint16[] who"),
+])  # fmt: skip
+def test_records_of_another_type_are_refused_in_one_line(tmp_path, capsys, kind, old, new):
+    theirs, settings = definition(kind), RunConfig(SwarmConfig(agents=3)).to_dict()
+    for name, custom in (("bag", {}), ("cf1.mcap", {AGENT: json.dumps({"id": 1})})):
+        with BagWriter(tmp_path / name, settings, custom_data=custom) as writer:
+            changed = dataclasses.replace(theirs, text=theirs.text.replace(old, new))
+            channel = writer.add_topic(SLOT_RECORD, kind, "reliable", changed)
+            writer.write(channel, pack_record(1, 0, SECOND, 1), SECOND, SECOND)
+    for command in ("verify", "report", "export"):
+        assert main([command, str(tmp_path / "bag")]) == 2
+        said = capsys.readouterr().err
+        assert f"{SLOT_RECORD} is {kind}, without fields" in said
+        assert said.count("\n") == 1
+    assert main(["merge", str(tmp_path / "cf1.mcap")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -17,9 +17,11 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import AgentBag, AgentRecorder, NothingWritten, read
 from dtsa_bench.log.arrays import split_log
+from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merge.timeline import Crossings, both_ways, fit
-from dtsa_bench.log.merged_flight import count_unmatched_frames, slots_until_all_known
+from dtsa_bench.log.merged_flight import MergedReplay, slots_until_all_known
+from dtsa_bench.log.record import AGENT
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.pages.report.data import run_data
 
@@ -115,10 +117,12 @@ def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: 
     later = read(bags[1])
     later.log = split_log(later.log, later.log.first_slot + len(later.log) // 2)
     log = Merge([read(bags[0]), later]).log
-    assert count_unmatched_frames(log) > 0
+    assert MergedReplay(log).count_unmatched_frames() > 0
     for agents, is_right in (([2], True), ([1], False)):
         log.merged["agents_that_gave_up_a_time"] = agents
-        assert (count_unmatched_frames(log) == 0) == is_right
+        assert (MergedReplay(log).count_unmatched_frames() == 0) == is_right
+    log.merged["count"] = 9  # of a bag from elsewhere
+    assert "Merged from 2 agents' bags." in MergedReplay(log).run().notes[0]
 
 
 def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:
@@ -177,19 +181,39 @@ def test_clocks_are_fit_within_groups_connected_both_ways() -> None:
     assert line.flight_ns == pytest.approx(MS, abs=50_000)
 
 
+def _recorded(
+    path: Path, slots: list[int], steps: int = CONFIG.steps, about: dict[str, float] | None = None
+) -> AgentBag:
+    """The bag of an agent that took over another time wherever its slots count back; `about`: other values of it."""
+    zero, track = np.zeros(3), np.zeros((steps, 3))
+    with AgentRecorder(path, AgentSettings(id=1), CONFIG, UdpSettings(interface="lo")) as recorder:
+        for at, slot in enumerate(slots):
+            is_first = at == 0 or slot < slots[at - 1]
+            recorder.slot(SlotRecord(slot, 0, 0, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
+        custom = recorder._bag.custom_data
+        custom[AGENT] = json.dumps(json.loads(custom[AGENT]) | (about or {}))
+    return read(path)
+
+
 def test_slots_of_times_that_were_given_up_are_kept_apart(tmp_path: Path) -> None:
     """Two processes of an agent, each of which took over a time with smaller slot numbers."""
-    zero, track = np.zeros(3), np.zeros((CONFIG.steps, 3))
-
-    def process(name: str, slots: list[int]) -> AgentBag:
-        with AgentRecorder(tmp_path / name, AgentSettings(id=1), CONFIG, UdpSettings(interface="lo")) as recorder:
-            for at, slot in enumerate(slots):
-                is_first = at == 0 or slot < slots[at - 1]
-                recorder.slot(SlotRecord(slot, 0, 0, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
-        return read(tmp_path / name)
-
-    bags = [process("a.mcap", [70, 71, 3, 4]), process("b.mcap", [90, 91, 80, 5, 6])]
+    slots_of = {"a.mcap": [70, 71, 3, 4], "b.mcap": [90, 91, 80, 5, 6]}
+    bags = [_recorded(tmp_path / name, slots) for name, slots in slots_of.items()]
     slots = {key: np.flatnonzero(bag.log.known) + bag.log.first_slot for key, bag in Merge(bags).processes.items()}
     assert {key: values.tolist() for key, values in slots.items()} == {
         (1, 0): [3, 4], (1, 1): [5, 6], (1, -1): [70, 71], (1, -2): [80], (1, -3): [90, 91],
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("about", [
+    {"zero_ns": 1 << 70}, {"zero_ns": 1 << 62}, {"zero_ns": float("inf")}, {"started_ns": -(1 << 70)},
+    {"started_ns": 1 << 62},
+])  # fmt: skip
+def test_times_that_no_clock_shows_are_refused(tmp_path: Path, about: dict[str, float]) -> None:
+    with pytest.raises(UnusableBag, match="what it says of its agent cannot be read"):
+        _recorded(tmp_path / "cf1.mcap", [3, 4], about=about)
+
+
+def test_other_control_instants_than_those_of_the_settings_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnusableBag, match=f"control instants a slot, not {CONFIG.steps}"):
+        _recorded(tmp_path / "cf1.mcap", [3, 4], steps=CONFIG.steps + 1)

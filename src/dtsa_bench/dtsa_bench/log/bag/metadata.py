@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -85,15 +85,17 @@ def open_file(path: Path) -> IO[bytes]:
     try:
         if path.suffix != ".zstd":
             return path.open("rb")
-        unpacked = TemporaryFile()  # noqa: SIM115  the caller closes it
-        with path.open("rb") as packed, suppress(zstandard.ZstdError):  # of a damaged file the beginning is unpacked
-            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-            while block := reader.read(1 << 20):
-                unpacked.write(block)
-                if unpacked.tell() > MAX_UNPACKED_BYTES:
-                    raise UnusableBag(path, f"it is larger than {MAX_UNPACKED_BYTES >> 30} GiB when unpacked")
-        unpacked.seek(0)
-        return unpacked
+        with ExitStack() as stack:
+            unpacked = stack.enter_context(TemporaryFile())
+            with path.open("rb") as packed, suppress(zstandard.ZstdError):  # of a damaged file the beginning is unpacked
+                reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+                while block := reader.read(1 << 20):
+                    unpacked.write(block)
+                    if unpacked.tell() > MAX_UNPACKED_BYTES:
+                        raise UnusableBag(path, f"it is larger than {MAX_UNPACKED_BYTES >> 30} GiB when unpacked")
+            unpacked.seek(0)
+            stack.pop_all()
+            return unpacked
     except OSError as error:
         raise UnusableBag(path, f"cannot be read: {error.strerror or error}") from None
 

@@ -190,6 +190,18 @@ class Bag:
             raise UnusableBag(self.given, f"it has no topic {name!r}; it has {names}")
         return self.topics[name]
 
+    def register(self, topic: Topic) -> None:
+        """Make the type of a topic's messages known.
+
+        :raises UnusableBag: if its definition cannot be used.
+        """
+        try:
+            if topic.encoding != _ROS:
+                raise ValueError(f"it is recorded as {topic.encoding}, not as {_ROS}")
+            register_type(self.typestore, topic.type, topic.definition)
+        except ValueError as error:
+            raise UnusableBag(self.given, f"topic {topic.name}, {topic.type}: {error}") from None
+
     def decode(self, message: BagMessage) -> Any:
         """The message as an object with its fields as attributes; arrays of numbers are NumPy arrays.
 
@@ -197,13 +209,7 @@ class Bag:
         :raises BagError: if the bytes do not fit the type.
         """
         if message.type not in self.typestore.fielddefs:
-            topic = self.topic(message.topic)
-            try:
-                if topic.encoding != _ROS:
-                    raise ValueError(f"it is recorded as {topic.encoding}, not as {_ROS}")
-                register_type(self.typestore, topic.type, topic.definition)
-            except ValueError as error:
-                raise UnusableBag(self.given, f"topic {topic.name}, {topic.type}: {error}") from None
+            self.register(self.topic(message.topic))
         try:
             return self.typestore.deserialize_cdr(message.data, message.type)
         except NOT_OF_ITS_TYPE as error:

@@ -83,8 +83,9 @@ def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) ->
         return
     # Missions say what they fly with instead of a mode of runs.
     settings = bag.config if mode in (LOCKSTEP, MERGED) else {**bag.config, "mode": REALTIME}
-    contents = BagContents(bag, recorded_config(settings).swarm.slot_ns, result)
+    contents = BagContents(bag, recorded_config(settings).swarm, result)
     log = build_log(bag, contents.records)
+    log.settings = settings
     if mode == MERGED:
         check_merged(log, result)
     elif mode == LOCKSTEP:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import RUN_MESSAGES
 from dtsa_bench.log.arrays import FlightArrays
@@ -31,8 +32,8 @@ class BagContents:
     :raises Mismatch: if times, numbers or the run's id of a message are wrong, or one is missing.
     """
 
-    def __init__(self, bag: Bag, slot_ns: int, result: Result) -> None:
-        self._bag, self._slot_ns, self._result = bag, slot_ns, result
+    def __init__(self, bag: Bag, swarm: SwarmConfig, result: Result) -> None:
+        self._bag, self._slot_ns, self._steps, self._result = bag, swarm.slot_ns, swarm.steps, result
         self.records: list[Any] = []
         self.changes: dict[int, dict[str, Any]] = {}  # of the channel's settings, by the first slot in which they hold
         self._odometry: list[tuple[int, int, bytes]] = []  # slot, agent, message
@@ -44,7 +45,10 @@ class BagContents:
             encoded, has_run = topics[message.topic]
             times = message.log_time_ns, message.publish_time_ns
             self._digest.add(encoded, *times, message.sequence, message.data, has_run)
-            expected, slot = sequences[message.topic], max(0, (message.log_time_ns - names.TIME_ZERO_NS) // slot_ns)
+            expected, slot = (
+                sequences[message.topic],
+                max(0, (message.log_time_ns - names.TIME_ZERO_NS) // swarm.slot_ns),
+            )
             sequences[message.topic] = message.sequence + 1
             if message.sequence != expected and not result.broken_off:
                 why = "messages of a topic are numbered one after the other"
@@ -67,15 +71,16 @@ class BagContents:
         record, mode = self._bag.decode(message), self._result.mode
         slot, stamp = int(record.slot), record.header.stamp
         right = message.log_time_ns if mode == SNIFFER else names.slot_time_ns(slot, self._slot_ns)
-        for what, expected, recorded in (
-            ("log time", right, message.log_time_ns),
-            ("publish time", right, message.publish_time_ns),
-            ("stamp", right, int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)),
-            ("run", record.run if self._run is None else self._run, record.run),
-            ("frame_id", names.FRAME, record.header.frame_id),
+        on_time = "slots start one slot length after the other"
+        for what, expected, recorded, why in (
+            ("log time", right, message.log_time_ns, on_time),
+            ("publish time", right, message.publish_time_ns, on_time),
+            ("stamp", right, int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec), on_time),
+            ("run", record.run if self._run is None else self._run, record.run, "the run's id"),
+            ("frame_id", names.FRAME, record.header.frame_id, "all positions are in one frame"),
+            ("steps", self._steps, int(record.steps), "a slot has the control instants of the configuration"),
         ):
             if expected != recorded:
-                why = "slots start one slot length after the other" if what != "run" else "the run's id"
                 raise Mismatch(f"slot record, {what}", expected, recorded, why, slot)
         following = int(self.records[-1].slot) + 1 if self.records else slot if mode == MERGED else 0
         if slot != following and mode != SNIFFER:

@@ -19,7 +19,7 @@ from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.flight_log import log_of_flight
 from dtsa_bench.log.merge.merge import clocks_apart, receptions_of
-from dtsa_bench.log.merged_flight import MergedReplay, check_rules, count_unmatched_frames
+from dtsa_bench.log.merged_flight import MergedReplay, check_rules
 from dtsa_bench.log.replay import AgentReplay
 from dtsa_bench.log.rules import RuleChecker
 from dtsa_bench.runs.config import REALTIME
@@ -123,9 +123,7 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
 
     :raises Mismatch: at the first difference.
     """
-    own_clocks = result.mode == REALTIME
-    log.settings = {**log.settings, "mode": REALTIME}  # missions say what they fly with instead of a mode
-    run = log.config
+    run, own_clocks = log.config, result.mode == REALTIME
     frames, authenticator = FramesOnAir.of_log(log, run.air, own_clocks), None
     if run.swarm.auth:
         if key := os.environ.get(VARIABLE, ""):
@@ -145,6 +143,7 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
         result.count("summary.json")
     if own_clocks and (run.air.range_m or run.air.capture_db):
         result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
+        frames.check_numbers()
         if not run.air.airtime.line.serial:
             frames.check_overlaps()
             result.count("frames that no agent received together", len(frames.slot))
@@ -271,7 +270,7 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     if first := next((one for process in replay.processes for one in process.replay.differences), None):
         raise decision_difference(first, log, "follows from what the agent says to have heard")
     result.count("decisions made again", replay.equal)
-    if others := about["frames_heard_not_as_sent"] + count_unmatched_frames(log):
+    if others := about["frames_heard_not_as_sent"] + replay.count_unmatched_frames():
         why = "no agent hears a frame that was not sent"
         raise Mismatch("frames heard", "as they were sent", f"{others} others", why)
     if apart := about["not_determined"]:

@@ -84,6 +84,22 @@ class FramesOnAir:
                 collided[k], count = verdict.collided or 0, count + k.stop - k.start
         return received, lost, collided, count
 
+    def check_numbers(self) -> None:
+        """Whether each receiver of a frame counts once, and its sender not at all, where verdicts cannot be made again.
+
+        :raises Mismatch: at the first frame for which that is not so.
+        """
+        most = self.config.agents - 1
+        for k in np.flatnonzero(self.received[np.arange(len(self.sender)), self.sender - 1])[:1].tolist():
+            sender = int(self.sender[k])
+            values = "others only", f"cf{sender}"
+            raise Mismatch("received", *values, "no agent hears itself", int(self.slot[k]), sender)
+        count = self.received.sum(axis=1) + self.lost + self.collided
+        for k in np.flatnonzero(count > most)[:1].tolist():
+            values = f"{most} receivers at most", f"{count[k]}"
+            at = int(self.slot[k]), int(self.sender[k])
+            raise Mismatch("received, lost, collided", *values, "each counts once", *at)
+
     def check_overlaps(self) -> None:
         """Whether agents received no two frames at one time, and none while they sent. Not for radios behind lines.
 

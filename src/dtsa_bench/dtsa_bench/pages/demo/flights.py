@@ -199,13 +199,15 @@ def fly_all(steps: Sequence[Sequence[DemoFlight]], directory: Path, stop: Stop) 
             raise
 
     finished: dict[str, FinishedFlight] = {}
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        flown = zip(lockstep, pool.map(fly_demo_flight, lockstep), strict=True)
-        for number, (flight, result) in enumerate(flown, 1):
-            line.show(f"{number} of {len(lockstep)} flown")
-            if result is not None:
-                finished[flight.key] = read_flight(flight, result)
-    line.end()
+    try:
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            flown = zip(lockstep, pool.map(fly_demo_flight, lockstep), strict=True)
+            for number, (flight, result) in enumerate(flown, 1):
+                line.show(f"{number} of {len(lockstep)} flown")
+                if result is not None:
+                    finished[flight.key] = read_flight(flight, result)
+    finally:
+        line.end()
     for flight in demo:
         if flight.live and not stop:
             finished[flight.key] = _fly_live(flight, directory / flight.key, stop)
