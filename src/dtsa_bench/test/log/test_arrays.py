@@ -63,10 +63,13 @@ def test_one_wrong_receiver_never_passes(frames: list[tuple[int, int, int]], fra
     assert not equal_again(sent)
 
 
-@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9))
-@settings(max_examples=60, deadline=None)
-def test_the_channels_own_verdicts_never_overlap(frames: list[tuple[int, int, int]], loss: float, seed: int) -> None:
-    _, sent = resolved(ChannelConfig(agents=5, loss=loss, seed=seed), frames)
+@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9), st.sampled_from(("plain", "crazyflie")))
+@settings(max_examples=80, deadline=None)
+def test_by_who_received_what_frames_arrive_when_the_channel_says_and_never_overlap(frames, loss, seed, radio):
+    verdicts, sent = resolved(ChannelConfig(agents=5, loss=loss, seed=seed, radio=radio), frames)
+    sent.find_times()
+    for v in verdicts:
+        assert (sent.end_ns[v.frame_id], sent.arrival_ns[v.frame_id]) == (v.end_ns, v.arrival_ns)
     sent.check_overlaps()
 
 

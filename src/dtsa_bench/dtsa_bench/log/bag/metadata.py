@@ -87,7 +87,8 @@ def open_file(path: Path) -> IO[bytes]:
             return path.open("rb")
         with ExitStack() as stack:
             unpacked = stack.enter_context(TemporaryFile())
-            with path.open("rb") as packed, suppress(zstandard.ZstdError):  # of a damaged file the beginning is unpacked
+            # Of a damaged file the beginning is unpacked.
+            with path.open("rb") as packed, suppress(zstandard.ZstdError):
                 reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
                 while block := reader.read(1 << 20):
                     unpacked.write(block)

@@ -144,9 +144,9 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
     if own_clocks and (run.air.range_m or run.air.capture_db):
         result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
         frames.check_numbers()
-        if not run.air.airtime.line.serial:
-            frames.check_overlaps()
-            result.count("frames that no agent received together", len(frames.slot))
+        frames.find_times()
+        frames.check_overlaps()
+        result.count("frames that no agent received together", len(frames.slot))
     else:
         # Frames that are lost may have been on the air together with the last ones that are there.
         until_ns = (len(log) - 1) * log.slot_ns if result.broken_off else 1 << 62

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -11,12 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_bench.log.arrays import FlightArrays, ReceivedFrames
-from dtsa_channel_sim import Air, Channel, ChannelConfig
+from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
 
 from .result import Mismatch
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+
+class _RecordedMedium:
+    """A medium in which frames are received by whom a log says."""
+
+    def __init__(self, frames: FramesOnAir) -> None:
+        self.config = frames.config
+        self._next: list[deque[Mask]] = [deque() for _ in range(self.config.agents + 1)]  # by sender
+        for k in np.argsort(frames.asked_ns, kind="stable").tolist():
+            self._next[frames.sender[k]].append(frames.received[k])
+
+    def medium(self, slot: int) -> _RecordedMedium:
+        return self
+
+    def advance(self, slot: int) -> None:
+        pass
+
+    def resolve(self, slot: int, frame: OnAir, others: Sequence[OnAir], positions: Any = None) -> Reception:
+        return Reception(self._next[frame.sender].popleft(), 0, 0)
 
 
 @dataclass(slots=True)
@@ -33,7 +53,7 @@ class FramesOnAir:
     asked_ns: Ints  # (F,) for when each sender handed its frame to its radio
     own_clocks: bool = True  # frames start when their sender's clock says so; otherwise with their slot
     positions: NDArray[np.float64] | None = None  # (S, 3, N) m, at the start of each slot
-    # Without other frames; with those that a radio has to hand over before, from `resolve_again` on.
+    # Without other frames; with those that a radio has to hand over before, from `resolve_again` or `find_times` on.
     end_ns: Ints = field(init=False)  # (F,) of the transmission
     arrival_ns: Ints = field(init=False)  # (F,) when the last of the receivers had it
 
@@ -63,16 +83,11 @@ class FramesOnAir:
         for slot, values in changes.items():
             channel.set(slot=slot, **values)
         received, lost, collided = self.received.copy(), self.lost.copy(), self.collided.copy()
-        if self.own_clocks:  # on one time line
-            air = Air[int](channel)
-            for k in np.argsort(self.asked_ns, kind="stable").tolist():
-                air.begin(k, int(self.sender[k]), int(self.asked_ns[k]), int(self.length[k]))
-            while air.pending:
-                for v in air.resolve(air.due_ns):
+        if self.own_clocks:
+            for v in self._on_one_line(channel):
+                if v.end_ns <= until_ns:
                     k = v.frame_id
-                    self.end_ns[k], self.arrival_ns[k] = v.end_ns, v.arrival_ns
-                    if v.end_ns <= until_ns:
-                        received[k], lost[k], collided[k], count = v.received, v.lost, v.collided, count + 1
+                    received[k], lost[k], collided[k], count = v.received, v.lost, v.collided, count + 1
             return received, lost, collided, count
         edges = np.flatnonzero(np.diff(self.slot, prepend=-1, append=-1)).tolist()
         for k in (slice(*edge) for edge in pairwise(edges)):  # the frames of a slot
@@ -83,6 +98,22 @@ class FramesOnAir:
                 received[k], lost[k] = verdict.mask(self.config.agents), verdict.lost or 0
                 collided[k], count = verdict.collided or 0, count + k.stop - k.start
         return received, lost, collided, count
+
+    def _on_one_line(self, media: Any) -> Iterator[FrameVerdict[int]]:
+        """The verdicts on all frames on one time line; they say when each frame has left and arrived."""
+        air = Air[int](media)
+        for k in np.argsort(self.asked_ns, kind="stable").tolist():
+            air.begin(k, int(self.sender[k]), int(self.asked_ns[k]), int(self.length[k]))
+        while air.pending:
+            for verdict in air.resolve(air.due_ns):
+                k = verdict.frame_id
+                self.end_ns[k], self.arrival_ns[k] = verdict.end_ns, verdict.arrival_ns
+                yield verdict
+
+    def find_times(self) -> None:
+        """Find when frames left and arrived, by who received which, where verdicts cannot be made again."""
+        for _ in self._on_one_line(_RecordedMedium(self)):
+            pass
 
     def check_numbers(self) -> None:
         """Whether each receiver of a frame counts once, and its sender not at all, where verdicts cannot be made again.
@@ -101,16 +132,15 @@ class FramesOnAir:
             raise Mismatch("received, lost, collided", *values, "each counts once", *at)
 
     def check_overlaps(self) -> None:
-        """Whether agents received no two frames at one time, and none while they sent. Not for radios behind lines.
-
-        Where verdicts cannot be made again, because they depend on places that are not recorded.
+        """Whether agents received no two frames at one time, and none while they sent, by the times that were found.
 
         :raises Mismatch: at the first frame for which that is not so.
         """
         on_air_ns = np.array([self.config.airtime.on_air_ns(length) for length in self.length.tolist()], np.int64)
         for agent in range(1, self.config.agents + 1):
-            own = self.sender == agent  # it is deaf from the order to send on
-            begin_ns = np.where(own, self.asked_ns, self.end_ns - on_air_ns)
+            own = self.sender == agent
+            # It is deaf from the order to send on.
+            begin_ns = self.end_ns - on_air_ns - self.config.airtime.ramp_up_ns * own
             frames = np.flatnonzero(own | self.received[:, agent - 1])
             frames = frames[np.argsort(begin_ns[frames], kind="stable")]
             before, after = frames[:-1], frames[1:]
