@@ -28,7 +28,7 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import pack_received
+from dtsa_agent.ros.common.cdr import ns_of, pack_received
 from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS, ReceivedFrames
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
@@ -366,7 +366,7 @@ def _make_bag(file: Path, custom: dict[str, str], records: Sequence[Any]) -> Age
     whole_ns = int(custom.get(BROKEN_OFF, 1 << 63))  # `recover` has made this file of one that was not finished
     times: list[list[Any]] = [[]]  # records, of each time that the agent has taken over
     for record in records:
-        if record.header.stamp.sec * 1_000_000_000 + record.header.stamp.nanosec > whole_ns:
+        if ns_of(record.header.stamp) > whole_ns:
             continue
         if times[-1] and record.slot <= times[-1][-1].slot:
             if not record.presence[0] & NEW:

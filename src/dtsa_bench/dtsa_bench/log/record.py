@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import pack_received, split_frames, unpack_received
+from dtsa_agent.ros.common.cdr import SECOND, ns_of, pack_received, split_frames, unpack_received
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
@@ -28,7 +28,6 @@ _HEADER = "std_msgs/msg/Header"
 FORMAT, FORMAT_KEY = "2", "format"  # of bags, and its name in custom data
 AGENT, SNIFFER = "agent", "sniffer"  # custom data: what the record of one agent, or of a listener, says of itself
 _OF_FORMAT_1 = {f"{names.SWARM}/{topic}" for topic in (names.RECEPTION, names.TRANSMISSION, names.DECISION)}
-_SECOND = 1_000_000_000
 _KINDS = {
     "agent": "u2", "presence": "u1", "chosen": "u2", "reason": "u1", "digest": "u4", "score": "f8", "offset_ns": "i8",
     "track": "f8", "velocity": "f8", "command": "f8", "goal": "f8", "sender": "u2", "length": "u1", "data": "u1",
@@ -47,7 +46,7 @@ def _store() -> Any:
 
 
 def _header(time_ns: int) -> Any:
-    stamp = _store().types["builtin_interfaces/msg/Time"](*divmod(time_ns, _SECOND))
+    stamp = _store().types["builtin_interfaces/msg/Time"](*divmod(time_ns, SECOND))
     return _store().types[_HEADER](stamp, names.FRAME)
 
 
@@ -198,8 +197,7 @@ def make_log(
             continue
         arrays["recorded"][row], arrays["known"][row, at], arrays["presence"][row, at] = True, True, PRESENT
         arrays["outcome"][row] = min(int(record.outcome), UNKNOWN)
-        time_ns = int(record.header.stamp.sec) * _SECOND + int(record.header.stamp.nanosec)
-        arrays["start_ns"][row] = time_ns - names.TIME_ZERO_NS
+        arrays["start_ns"][row] = ns_of(record.header.stamp) - names.TIME_ZERO_NS
         _fill(arrays, record, _BY_AGENT, row, at)
         if len(columns):
             _fill(arrays, record, _BY_SENDER, row, columns)

@@ -20,9 +20,10 @@ from rclpy.serialization import deserialize_message
 from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.cdr import ns_of
 from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start
 from dtsa_agent.ros.common.loop import Feed
-from dtsa_agent.ros.common.messages import Fields, header_of, ns_of, read_report
+from dtsa_agent.ros.common.messages import Fields, header_of, read_report
 from dtsa_channel_sim.model.air import NEVER, FrameVerdict, LiveAir
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict

@@ -29,6 +29,11 @@ _WITH_RUN = "Slot Transmission Frame Report Reception Decision Configuration Run
 RUN_MESSAGES = frozenset(f"dtsa_msgs/msg/{name}" for name in _WITH_RUN.split())
 
 
+def ns_of(stamp: Any) -> int:
+    """Return the time of a builtin_interfaces/Time, of ROS or of another decoder, ns."""
+    return int(stamp.sec) * SECOND + int(stamp.nanosec)
+
+
 class CdrMessage:
     """Messages of numbers and of sequences of numbers, behind a header in frame ``map``.
 

@@ -85,8 +85,3 @@ def time_of(time_ns: int) -> Time:
 def header_of(time_ns: int) -> Header:
     """Return a message's header in frame ``map``."""
     return Header(stamp=time_of(time_ns), frame_id=names.FRAME)
-
-
-def ns_of(time: Time) -> int:
-    """Return a message's time, ns."""
-    return int(time.sec) * SECOND + int(time.nanosec)

@@ -8,7 +8,7 @@ from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import RUN_MESSAGES
+from dtsa_agent.ros.common.cdr import RUN_MESSAGES, ns_of
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.cdr import OdometryPacker
 from dtsa_bench.log.bag.errors import UnusableBag
@@ -69,13 +69,13 @@ class BagContents:
 
     def _add_record(self, message: BagMessage) -> None:
         record, mode = self._bag.decode(message), self._result.mode
-        slot, stamp = int(record.slot), record.header.stamp
+        slot = int(record.slot)
         right = message.log_time_ns if mode == SNIFFER else names.slot_time_ns(slot, self._slot_ns)
         on_time = "slots start one slot length after the other"
         for what, expected, recorded, why in (
             ("log time", right, message.log_time_ns, on_time),
             ("publish time", right, message.publish_time_ns, on_time),
-            ("stamp", right, int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec), on_time),
+            ("stamp", right, ns_of(record.header.stamp), on_time),
             ("run", record.run if self._run is None else self._run, record.run, "the run's id"),
             ("frame_id", names.FRAME, record.header.frame_id, "all positions are in one frame"),
             ("steps", self._steps, int(record.steps), "a slot has the control instants of the configuration"),

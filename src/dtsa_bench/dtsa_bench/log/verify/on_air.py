@@ -90,13 +90,13 @@ class FramesOnAir:
                     received[k], lost[k], collided[k], count = v.received, v.lost, v.collided, count + 1
             return received, lost, collided, count
         edges = np.flatnonzero(np.diff(self.slot, prepend=-1, append=-1)).tolist()
-        for k in (slice(*edge) for edge in pairwise(edges)):  # the frames of a slot
-            slot = int(self.slot[k.start])
+        for at in (slice(*edge) for edge in pairwise(edges)):  # the frames of a slot
+            slot = int(self.slot[at.start])
             positions = None if self.positions is None else self.positions[slot]
-            verdict = channel.arbitrate(slot, self.sender[k].tolist(), self.length[k].tolist(), positions)
-            if (self.end_ns[k] <= until_ns).all():
-                received[k], lost[k] = verdict.mask(self.config.agents), verdict.lost or 0
-                collided[k], count = verdict.collided or 0, count + k.stop - k.start
+            verdict = channel.arbitrate(slot, self.sender[at].tolist(), self.length[at].tolist(), positions)
+            if (self.end_ns[at] <= until_ns).all():
+                received[at], lost[at] = verdict.mask(self.config.agents), verdict.lost or 0
+                collided[at], count = verdict.collided or 0, count + at.stop - at.start
         return received, lost, collided, count
 
     def _on_one_line(self, media: Any) -> Iterator[FrameVerdict[int]]:

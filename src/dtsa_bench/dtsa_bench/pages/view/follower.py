@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core import make_scenario
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import split_frames, unpack_received
+from dtsa_agent.ros.common.cdr import ns_of, split_frames, unpack_received
 from dtsa_bench.log.arrays import recorded_config
 from dtsa_bench.log.replay import TableReplay
 from dtsa_bench.runs.config import RunConfig
@@ -120,8 +120,7 @@ class Follower:
         if not np.abs(position).max(initial=0.0) < _FARTHEST_M:
             raise ValueError("positions that are no numbers, or far away")
         self._position[:, self._index([sphere.id for sphere in spheres])] = position.T
-        stamp = spheres[0].header.stamp
-        slot = (stamp.sec * 10**9 + stamp.nanosec - names.TIME_ZERO_NS) // self._slot_ns
+        slot = (ns_of(spheres[0].header.stamp) - names.TIME_ZERO_NS) // self._slot_ns
         self._builder.add_positions(slot, self._position)
         self._detect_crashes(slot)
 
