@@ -83,8 +83,10 @@ class Pair:
 TWO: dict[str, Any] = {"robot1": {"topics": {"text": {"bytes": 20}}}, "robot2": {}}
 
 
-def received_numbers(graph: Graph, path: Path, channel: dict[str, Any], every_s: float) -> dict[str, set[int]]:
-    """Three robots send a hundred numbers to each other, one in ``every_s``; return what came, by pair."""
+def received_numbers(
+    graph: Graph, path: Path, channel: dict[str, Any], every_s: float
+) -> tuple[dict[str, set[int]], dict[str, int]]:
+    """Three robots send a hundred numbers to each other, one in ``every_s``; return what came and how many collided."""
     robots = ("robot1", "robot2", "robot3")
     qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # whoever finds the other late
     node, made, reports = graph.node, [], {}  # type: ignore[var-annotated]
@@ -112,13 +114,15 @@ def received_numbers(graph: Graph, path: Path, channel: dict[str, Any], every_s:
 
     def all_accounted() -> bool:
         return all(
-            int(reports[pair]["lost"]) + len(came) == 100 == int(reports[pair]["sent"]) if pair in reports else False
+            pair in reports
+            and int(reports[pair]["lost"]) + int(reports[pair]["collided"]) + len(came) == 100
+            and reports[pair]["sent"] == "100"
             for pair, came in numbers.items()
         )
 
     graph.until(all_accounted)
-    assert all(counts["dropped"] == counts["out_of_range"] == counts["collided"] == "0" for counts in
-               (reports[pair] for pair in numbers))  # fmt: skip
+    assert all(reports[pair]["dropped"] == reports[pair]["out_of_range"] == "0" for pair in numbers)
+    collided = {pair: int(reports[pair]["collided"]) for pair in numbers}
     assert all(float(reports[pair]["delay_mean_ms"]) > 0.4 for pair in numbers)
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 0
@@ -127,21 +131,27 @@ def received_numbers(graph: Graph, path: Path, channel: dict[str, Any], every_s:
     for subscription in made:
         node.destroy_subscription(subscription)
     graph.until(lambda: not any(node.count_publishers(topic) for topic in outputs))
-    return numbers
+    return numbers, collided
 
 
 @pytest.mark.parametrize("access", ["unlimited", "lease"])
 def test_losses_are_those_of_the_seed_on_an_idle_and_a_busy_machine(graph: Graph, tmp_path: Path, access: str) -> None:
-    """Slowly, and in one go beside processes that take all time: of each pair the same numbers arrive."""
-    idle = received_numbers(graph, tmp_path / "idle.yaml", {"access": access}, 0.01)
+    """Slowly, and in one go beside processes that take all time: of each pair the same numbers arrive.
+
+    Under lease two that wake may send in the same OPEN turn: that depends on when they have something to send.
+    """
+    idle, collided_idle = received_numbers(graph, tmp_path / "idle.yaml", {"access": access}, 0.01)
     hogs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
     try:
-        busy = received_numbers(graph, tmp_path / "busy.yaml", {"access": access}, 0.0)
+        busy, collided_busy = received_numbers(graph, tmp_path / "busy.yaml", {"access": access}, 0.0)
     finally:
         for hog in hogs:
             hog.kill()
             hog.wait()
-    assert busy == idle
+    for pair, came in idle.items():
+        assert len(came - busy[pair]) <= collided_busy[pair]
+        assert len(busy[pair] - came) <= collided_idle[pair]
+        assert max(collided_idle[pair], collided_busy[pair]) <= (5 if access == "lease" else 0)
     assert all(50 < len(came) < 90 for came in idle.values())
     assert len({frozenset(came) for came in idle.values()}) == len(idle)
 
