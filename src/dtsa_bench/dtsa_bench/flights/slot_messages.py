@@ -12,7 +12,8 @@ from visualization_msgs.msg import MarkerArray
 
 from dtsa_agent.core import REASONS, Scenario
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import CdrMessage, pack_received
+from dtsa_agent.ros.common.cdr import pack_received
+from dtsa_agent.ros.common.messages import CdrMessage
 from dtsa_bench.log.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPacker
 from dtsa_bench.log.record import frame_fields, pack_record
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
