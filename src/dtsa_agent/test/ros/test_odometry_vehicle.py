@@ -7,6 +7,7 @@ import random
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -115,7 +116,7 @@ def test_an_agent_that_never_had_odometry_says_so_and_fails(tmp_path: Path) -> N
 def test_a_vehicle_that_has_to_hover_returns_to_where_that_began(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = OdometryVehicle.__new__(OdometryVehicle)
     vehicle._every, vehicle._hold, sent = 1, None, []
-    monkeypatch.setattr(vehicle, "_fresh", lambda: (0.0, None, None))
+    vehicle._odometry = SimpleNamespace(is_fresh=True)
     monkeypatch.setattr(vehicle, "_command", lambda velocity: sent.append(velocity.tolist()))
     swarm = make_swarm(SwarmConfig(agents=2, policy="lease"), None, local=[1])
 

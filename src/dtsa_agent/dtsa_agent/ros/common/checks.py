@@ -29,7 +29,6 @@ SIZES = "sizes"  # arrays that do not fit together
 RANGE = "range"  # numbers that cannot be
 SLOT = "slot"  # of a slot that cannot be under way
 FORGED_END = "forged end"
-REASONS = (UNREADABLE, OTHER_RUN, OTHER_SENDER, UNKNOWN, SIZES, RANGE, SLOT, FORGED_END)
 
 LARGEST_SLOT = names.FIRST_CALL - 1  # 248 days of 10 ms slots
 FARTHEST_M = 1e6  # no vehicle is farther from the room's centre, or faster, than this many m or m/s
@@ -41,7 +40,7 @@ _LOG_S = 5.0  # from one line in the log to the next
 
 
 class BadMessage(RemoteProtocolError):
-    """A message that is not received, for one of :data:`REASONS`; the text says what is wrong with it."""
+    """A message that is not received, for one of the reasons above; the text says what is wrong with it."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(detail)

@@ -27,12 +27,11 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.stop import Stop
 
 from .checks import UNREADABLE, Intake
 
 _POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
-HOUSEKEEPING_S = 0.1
+_HOUSEKEEPING_S = 0.1
 _SPIN_S = 5.0  # an executor looks for rarer things that often
 _MOST_DROPPED = 16  # messages thrown away in a row before others get their turn
 _SERVING_S, _END_S = 0.5, 2.0
@@ -91,21 +90,21 @@ def _libraries() -> tuple[Any, Any] | None:
 class Feed:
     """A subscription whose messages are read by its owner, at its own time.
 
-    :param intake: counts messages that cannot be read; None: they are errors.
-    :param admits: says by a message and its sender whether it is received; None: all are.
+    :param intake: counts messages that cannot be read or fail the check; None: they are errors.
+    :param check: raises BadMessage if a message of a sender is not to be received; only with an intake.
     :param read: makes messages of serialised bytes, in place of rclpy; ``bytes``: they are given as they are.
     """
 
     def __init__(
         self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, intake: Intake | None = None,
-        admits: Callable[[Any, bytes | None], bool] | None = None, read: Callable[[bytes], Any] | None = None,
+        check: Callable[[Any, bytes | None], None] | None = None, read: Callable[[bytes], Any] | None = None,
     ) -> None:  # fmt: skip
         self.sender: bytes | None = None  # participant of DDS, a process, that sent the last message; None: not known
         self.subscription = node.create_subscription(
             msg_type, topic, self._refuse, qos, callback_group=_NoExecutor(), raw=True
         )
         self.handle = self.subscription.handle
-        self._type, self._intake, self._admits = msg_type, intake, admits
+        self._type, self._intake, self._check = msg_type, intake, check
         self._read = read or partial(deserialize_message, message_type=msg_type)
         self._stack = ExitStack()
         self._stack.enter_context(self.handle)
@@ -151,7 +150,10 @@ class Feed:
                     raise
                 self._intake.drop(UNREADABLE, f"no {self._type.__name__}: {(str(error).splitlines() or [''])[0]}")
                 continue
-            if self._admits is None or self._admits(message, self.sender):
+            if self._check is None or self._intake is None:
+                return message
+            with self._intake.guard():
+                self._check(message, self.sender)
                 return message
         return None
 
@@ -206,11 +208,16 @@ class Loop(Feed):
             return any(wait_set.get_ready_entities(kind) for kind in entities)
 
     def housekeeping(self) -> bool:
-        """Serve parameters and timers if it is time; return whether it was."""
+        """Serve parameters and timers if it is time; return whether it was: about ten times a second.
+
+        ExternalShutdownException: the node's context has been shut down.
+        """
         now = time.monotonic()
         if now < self._next_housekeeping:
             return False
-        self._next_housekeeping = now + HOUSEKEEPING_S
+        if not self._node.context.ok():
+            raise ExternalShutdownException
+        self._next_housekeeping = now + _HOUSEKEEPING_S
         if self._needs_executor():
             if self._executor is None:
                 self._executor = SingleThreadedExecutor(context=self._node.context)
@@ -219,17 +226,6 @@ class Loop(Feed):
             for _ in range(2):
                 self._executor.spin_once(timeout_sec=0.0)
         return True
-
-    def run(self, on_message: Callable[[Any], bool], idle: Callable[[], None], stop: Stop) -> None:
-        """Call back until ``on_message`` returns False or a signal comes; ``idle`` about ten times a second."""
-        while not stop:
-            message = self.wait()
-            if message is not None and not on_message(message):
-                return
-            if self.housekeeping():
-                idle()
-            if not self._node.context.ok():
-                raise ExternalShutdownException
 
 
 class ExecutorThread:
