@@ -102,7 +102,7 @@ class AgentsNode(ABC):
         """
         while not self._has_ended(stop) and self._serve():
             if self.loop.housekeeping():
-                self._look_around()
+                self._check_graph()
 
     def _has_ended(self, stop: Stop) -> bool:
         """Whether to end now because of a signal."""
@@ -113,7 +113,7 @@ class AgentsNode(ABC):
         self._processes.wait_for_all_acked(_DELIVERY)
         self.loop.close()
 
-    def _look_around(self) -> None:
+    def _check_graph(self) -> None:
         """Log what is waited for, and that slot 0 has begun; LocalProtocolError: the channel has gone."""
         subscription = self.loop.subscription
         publishers = subscription.get_publisher_count()

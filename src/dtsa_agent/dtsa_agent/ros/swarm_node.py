@@ -30,7 +30,6 @@ class SwarmNode(AgentsNode):
     def __init__(self, node: Node, swarm: Swarm, swarm_namespace: str = names.SWARM) -> None:
         self.agents = AgentGroup(swarm)
         self._goal = b""  # as last sent
-        self._no_frames = unpack_received(b"", 0, swarm.config.agents)
         self._agent_ids = array("H", swarm.ids).tobytes()
         self._bytes = b""  # the last answer
         topic = f"{swarm_namespace}/{names.TRANSMISSION}"
@@ -67,10 +66,8 @@ class SwarmNode(AgentsNode):
             if self.config.auth and not self.config.auth_session:
                 self.swarm.begin_session(session)
         else:
-            received, frames = self._no_frames, []
-            if message.length:
-                received = unpack_received(message.received, len(message.length), self.config.agents)
-                frames = split_frames(message.data, message.length)
+            received = unpack_received(message.received, len(message.length), self.config.agents)
+            frames = split_frames(message.data, message.length)
             self.agents.on_frames(slot - 1, message.sender, frames, received)
             self.agents.on_slot_end()
         self._answer(slot, self.agents.on_slot(slot))

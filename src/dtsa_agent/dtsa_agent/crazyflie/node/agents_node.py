@@ -94,15 +94,16 @@ class BridgedVehicle(AgentVehicle):
     """A vehicle that the bridge flies. Without odometry for a while it gets no commands, and the bridge holds it.
 
     :param name: of the vehicle.
-    :param fleet: all vehicles of this process, and whether they are to stop.
+    :param stop_order: whether all vehicles are to stop.
     """
 
     def __init__(
-        self, node: Node, name: str, settings: CrazyflieAgentsSettings, slot_s: float, fleet: Fleet, intake: Intake
-    ) -> None:
+        self, node: Node, name: str, settings: CrazyflieAgentsSettings, slot_s: float, stop_order: StopOrder,
+        intake: Intake,
+    ) -> None:  # fmt: skip
         self._every = max(1, round(1.0 / settings.command_hz / slot_s))
         self._fence = np.array([settings.fence_min, settings.fence_max])[:, :, None] if settings.fence else None
-        self._fleet = fleet
+        self._stop_order = stop_order
         x, y, z = settings.origin
         own = VehicleSettings(
             odometry_topic=f"/{name}/{names.ODOMETRY}", odometry_origin=(-x, -y, -z), fastest_mps=FASTEST_MPS
@@ -120,21 +121,21 @@ class BridgedVehicle(AgentVehicle):
     def fly(self, swarm: Swarm, slot: int) -> None:
         if slot % self._every:
             return
-        steer(swarm, slot, self._fence, self._fleet.way(swarm))
+        steer(swarm, slot, self._fence, self._stop_order.way_apart(swarm))
         if self._odometry.is_fresh:
             message = VelocityWorld()
             message.vel.x, message.vel.y, message.vel.z = swarm.command[:, 0].tolist()
             self._publisher.publish(message)
 
 
-class Fleet:
+class StopOrder:
     """The agents of a process, and whether their vehicles are to stop where they are."""
 
     def __init__(self, node: Node, swarms: Sequence[Swarm], intake: Intake) -> None:
         self._swarms, self._stopping = swarms, False
         self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=intake)
 
-    def way(self, swarm: Swarm) -> NDArray[np.float64] | None:
+    def way_apart(self, swarm: Swarm) -> NDArray[np.float64] | None:
         """Return the way (m, (3, 1)) of an agent to where its vehicle comes to rest; None: it flies on."""
         self._stopping |= self._stop_here.take() is not None
         if not self._stopping:
@@ -156,10 +157,10 @@ def _body(stop: Stop, supervised: bool) -> None:
             raise ConfigError("vehicles", station.vehicles, f"{config.agents} names")
         # One station, one clock: no offsets, and nothing to align.
         agents = RealtimeNode(node, config, ids, space, authenticator=authenticator(config), align=False)
-        fleet = Fleet(node, [agent.swarm for agent in agents.agents], agents.intake)
+        stop_order = StopOrder(node, [agent.swarm for agent in agents.agents], agents.intake)
         for agent in agents.agents:
             name = vehicles[agent.id - 1]
-            agent.vehicle = BridgedVehicle(node, name, station, config.slot_s, fleet, agents.intake)
+            agent.vehicle = BridgedVehicle(node, name, station, config.slot_s, stop_order, agents.intake)
         try:
             agents.run(stop)
         finally:

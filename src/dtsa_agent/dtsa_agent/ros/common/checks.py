@@ -55,18 +55,13 @@ class Intake:
         self._next_line_s = 0.0
         self.counts: Counter[str] = Counter()  # by reason
 
-    @property
-    def total(self) -> int:
-        """Number of all messages dropped."""
-        return self.counts.total()
-
     def drop(self, reason: str, detail: str) -> None:
         """Count a message."""
         self.counts[reason] += 1
         now = time.monotonic()
         if self._logger is not None and now >= self._next_line_s:
             self._next_line_s = now + _LOG_S
-            self._logger.warning(f"not taken in ({reason}): {detail}; {self.total} so far"[:_LONGEST_LINE])
+            self._logger.warning(f"not taken in ({reason}): {detail}; {self.counts.total()} so far"[:_LONGEST_LINE])
 
     @contextmanager
     def guard(self) -> Iterator[None]:
