@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import os
 import time
-from array import array
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,7 +39,7 @@ from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import split_frames, unpack_received
 from dtsa_agent.ros.common.checks import SIZES, SLOT, BadMessage, check_start
-from dtsa_agent.ros.common.messages import Fields, header_of
+from dtsa_agent.ros.common.messages import FRAME, Fields
 from dtsa_agent.stop import Stop
 
 from .agents_node import AgentsNode
@@ -340,5 +339,6 @@ class RealtimeNode(AgentsNode):
     def _send(self, agent: RealtimeAgent) -> None:
         """Hand the frame of an agent over to the channel, before anything else is done."""
         if agent.frame:
-            header, data = header_of(names.TIME_ZERO_NS + agent.start_ns - self._zero), array("B", agent.frame)
-            self._air.publish(Frame(header=header, run=self.run_id, slot=agent.slot, agent=agent.id, data=data))
+            time_ns = names.TIME_ZERO_NS + agent.start_ns - self._zero
+            fields = {"run": self.run_id, "slot": agent.slot, "agent": agent.id, "data": agent.frame}
+            self._air.publish(FRAME.pack_fields(time_ns, **fields))

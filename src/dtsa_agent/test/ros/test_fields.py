@@ -11,11 +11,20 @@ from hypothesis import strategies as st
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_msgs.msg import Report, Slot, Transmission
+from dtsa_msgs.msg import Frame, Report, Slot, Transmission
 from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.ros.common.cdr import ns_of
-from dtsa_agent.ros.common.messages import REPORT, SLOT, TRANSMISSION, CdrMessage, Fields, header_of, read_report
+from dtsa_agent.ros.common.messages import (
+    FRAME,
+    REPORT,
+    SLOT,
+    TRANSMISSION,
+    CdrMessage,
+    Fields,
+    header_of,
+    read_report,
+)
 
 MOST, STEPS = 12, 2
 words, stamps = st.integers(0, 2**32 - 1), st.integers(-(2**60), 2**60)
@@ -104,6 +113,12 @@ def test_arrays_of_a_report(message: Report) -> None:
         value, expected = getattr(fields, name), getattr(message, name)
         if not isinstance(expected, int):
             assert (value.itemsize, value.tobytes()) == (expected.itemsize, expected.tobytes())
+
+
+@given(words, words, VALUES["H"], st.binary(max_size=60), st.integers(0, 2**60))
+def test_frames_are_packed_as_by_rclpy(run: int, slot: int, agent: int, data: bytes, time_ns: int) -> None:
+    message = Frame(header=header_of(time_ns), run=run, slot=slot, agent=agent, data=array("B", data))
+    assert deserialize_message(FRAME.pack(time_ns, (run, slot, agent, data)), Frame) == message
 
 
 places, bits = st.integers(0, 10_000), st.integers(0, 255)

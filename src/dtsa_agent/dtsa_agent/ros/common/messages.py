@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from dtsa_msgs.msg import Report, Slot, Transmission
+from dtsa_msgs.msg import Frame, Report, Slot, Transmission
 from std_msgs.msg import Header
 
 from . import names
@@ -37,8 +37,8 @@ _Layout = tuple[struct.Struct, tuple[int, ...]]
 class CdrMessage:
     """Messages of numbers and of sequences of numbers behind a header, as plain CDR, little endian.
 
-    The first sequence is one of ids. Messages whose sequences have the same lengths share a struct; which one a message
-    needs is known by its length, as a rule.
+    What is read has ids in its first sequence. Messages whose sequences have the same lengths share a struct; which one
+    a message needs is known by its length, as a rule.
 
     :param fields: by name, in the message's order: a letter as in :mod:`struct`, with ``*`` before that of a sequence.
     """
@@ -143,7 +143,7 @@ def _codes_of(kind: Any) -> Iterator[tuple[str, str]]:
             yield name, f"*{_CODES[text[9:-1]]}" if text.startswith("sequence<") else _CODES[text]
 
 
-SLOT, TRANSMISSION, REPORT = (CdrMessage(dict(_codes_of(kind))) for kind in (Slot, Transmission, Report))
+SLOT, TRANSMISSION, REPORT, FRAME = (CdrMessage(dict(_codes_of(kind))) for kind in (Slot, Transmission, Report, Frame))
 
 
 def read_report(data: bytes) -> Fields:
