@@ -19,7 +19,6 @@ from typing import Any
 
 import rclpy
 from rclpy.callback_groups import CallbackGroup
-from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
@@ -229,28 +228,23 @@ class Loop(Feed):
 
 
 class ExecutorThread:
-    """Calls the callbacks of nodes in a thread of this name, from ``start`` to ``close``.
+    """Calls the callbacks of a node in a thread of this name until it is closed.
 
     ``Executor.spin`` in a thread raises when the executor is shut down under it; this ends between two callbacks.
     """
 
-    def __init__(self, context: Context, name: str, *nodes: Node) -> None:
-        self.executor = SingleThreadedExecutor(context=context)
-        for node in nodes:
-            self.executor.add_node(node)
-        self._context, self._closed = context, threading.Event()
+    def __init__(self, node: Node, name: str) -> None:
+        self.executor = SingleThreadedExecutor(context=node.context)
+        self.executor.add_node(node)
+        self._context, self._closed = node.context, threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
         """End it: a callback under way is waited for, 2 s at most."""
         self._closed.set()
-        if self._thread.is_alive():
-            self.executor.wake()
-            self._thread.join(_END_S)
+        self.executor.wake()
+        self._thread.join(_END_S)
         self.executor.shutdown(timeout_sec=0)
 
     def _run(self) -> None:
