@@ -46,8 +46,8 @@ class CdrMessage:
     def __init__(self, fields: Mapping[str, str]) -> None:
         self.fields = tuple(fields)
         self._codes = (*_HEADER.values(), *fields.values())
-        self._kinds = tuple(f"<{code[-1]}" for code in self._codes)  # of the elements, as NumPy has it
-        self._sizes = tuple(map(struct.calcsize, self._kinds))
+        self._sizes = tuple(struct.calcsize(f"<{code[-1]}") for code in self._codes)
+        self.kinds = {name: f"<{code[-1]}" for name, code in fields.items()}  #: of the elements, as NumPy has it
         sequences = [at for at, code in enumerate(self._codes) if code[0] == "*"]
         # A struct has the representation, and the fields; before each sequence the number of its elements.
         places = [1 + at + sum(sequence <= at for sequence in sequences) for at in range(len(self._codes))]
@@ -125,8 +125,8 @@ class CdrMessage:
     def arrays(self, fields: Fields) -> Fields:
         """Return the fields with sequences, but for the ids, as flat NumPy arrays."""
         return fields._replace(**{
-            name: np.frombuffer(value, kind)
-            for name, kind, value in zip(self.fields, self._kinds[len(_HEADER) :], fields[1:], strict=True)
+            name: np.frombuffer(value, self.kinds[name])
+            for name, value in zip(self.fields, fields[1:], strict=True)
             if isinstance(value, bytes)
         })  # fmt: skip
 
