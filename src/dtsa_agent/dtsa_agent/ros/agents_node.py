@@ -22,7 +22,7 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
 from dtsa_agent.ros.common import checks, names
 from dtsa_agent.ros.common.cdr import POSE_COVARIANCE, TWIST_COVARIANCE
-from dtsa_agent.ros.common.checks import BadMessage, Intake, PublisherGuard
+from dtsa_agent.ros.common.checks import BadMessage, Intake
 from dtsa_agent.ros.common.loop import Loop
 from dtsa_agent.ros.common.messages import SLOT, Fields, header_of
 from dtsa_agent.ros.common.runs import Call, Patience, WaitingLog, run_text
@@ -42,7 +42,7 @@ _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the la
 @dataclass(slots=True)
 class _Caller:
     call: Call
-    publisher: PublisherGuard
+    sender: bytes | None  # of its messages
     introductions: int = 0  # on calls of a run under way
 
 
@@ -161,7 +161,7 @@ class AgentsNode(ABC):
             self._publish_counts()
             return
         self._check_next(message)
-        if not caller.publisher.admits(time.monotonic(), sender):
+        if sender != caller.sender:
             raise BadMessage(checks.OTHER_SENDER, f"a slot message of run {run_text(run)}, not of its channel")
         if phase == Slot.REFUSE:
             self._read_refusal(message.data)
@@ -177,7 +177,7 @@ class AgentsNode(ABC):
             raise BadMessage(checks.RANGE, f"an unreadable call: {error}") from None
         while len(self._callers) >= _MOST_CALLERS:
             del self._callers[next(run for run in self._callers if run != self.run_id)]
-        caller = self._callers[run] = _Caller(call, PublisherGuard(sender))
+        caller = self._callers[run] = _Caller(call, sender)
         return caller
 
     def _begin_run(self, run: int) -> int:

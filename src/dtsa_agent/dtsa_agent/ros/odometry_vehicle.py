@@ -27,7 +27,7 @@ from dtsa_agent.core.settings.declaration import Setting, Settings, setting, set
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import ns_of
-from dtsa_agent.ros.common.checks import OTHER_SENDER, RANGE, BadMessage, Intake, PublisherGuard, check_odometry
+from dtsa_agent.ros.common.checks import OTHER_SENDER, RANGE, BadMessage, Intake, check_odometry
 from dtsa_agent.ros.common.loop import Loop
 from dtsa_agent.ros.common.parameters import check_parameters, declare_setting, declare_settings
 from dtsa_agent.stop import Stop
@@ -41,6 +41,7 @@ BODY, MAP = "body", "map"
 TWIST, VELOCITY_WORLD = "twist", "velocity_world"
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LONGEST_PREDICTION_S = 0.15
+_SILENT_S = 0.3  # after such a silence another publisher may take over
 _SLACK_M = 0.5  # odometry may be off by this from one message to the next
 HOLD_GAIN, HOLD_MPS = 1.0, 0.3  # 1/s, m/s: of an agent that hovers: real air does not leave it where it is
 _STOPS, _STOPS_S = 5, 0.1  # how often an agent that ends tells its vehicle to stop, within which time
@@ -87,8 +88,8 @@ class VehicleOdometry:
         self, node: Node, settings: VehicleSettings, intake: Intake, frame: str = "", is_stamped: bool = False
     ) -> None:
         self._settings, self._frame, self._is_stamped = settings, frame, is_stamped
-        self._guard = PublisherGuard()
-        self._came_s = -math.inf  # the last accepted one, s, monotonic
+        self._sender: bytes | None = None  # of the last accepted one
+        self._came_s = -math.inf  # s, monotonic: when that came
         self._measured_s = 0.0  # when its vehicle was there
         self._position = self._velocity = np.zeros(3)  # m, m/s, map: of the same
         self.attitude = (0.0, 0.0, 0.0, 1.0)  # of the same, x, y, z, w
@@ -119,7 +120,7 @@ class VehicleOdometry:
     def _accept(self, message: Odometry, sender: bytes | None) -> None:
         check_odometry(message)
         now, fastest = time.monotonic(), self._settings.fastest_mps
-        if not self._guard.admits(now, sender):
+        if sender != self._sender and now - self._came_s < _SILENT_S:
             raise BadMessage(OTHER_SENDER, f"{self._settings.odometry_topic} from two publishers")
         place, speed, q = message.pose.pose.position, message.twist.twist.linear, message.pose.pose.orientation
         position = np.array((place.x, place.y, place.z))
@@ -133,7 +134,7 @@ class VehicleOdometry:
         if math.dist(position, self._position) > _SLACK_M + fastest * (now - self._came_s):
             raise BadMessage(RANGE, "odometry that has jumped")
         age_s = time.time() - ns_of(message.header.stamp) / 1e9 if self._is_stamped else 0.0
-        self._came_s, self._measured_s = now, now - min(max(0.0, age_s), _LONGEST_PREDICTION_S)
+        self._sender, self._came_s, self._measured_s = sender, now, now - min(max(0.0, age_s), _LONGEST_PREDICTION_S)
         self._position, self._velocity, self.attitude = position, velocity, attitude
 
 

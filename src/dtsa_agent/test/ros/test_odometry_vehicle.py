@@ -6,12 +6,15 @@ import math
 import random
 import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from node_helpers import Graph, end_of, ros_graph
+from node_helpers import Graph, end_of, graph_in, ros_graph
+from rclpy.publisher import Publisher
+from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -20,7 +23,9 @@ from nav_msgs.msg import Odometry
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, rotate
+from dtsa_agent.ros.common.checks import OTHER_SENDER, Intake
+from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, VehicleOdometry, VehicleSettings, rotate
+from dtsa_bench.flights.domain import ros_domain
 
 AGENT = "dtsa_agent.ros.agent_node"
 STEP_S = 0.02
@@ -73,6 +78,32 @@ class Vehicle:
 def test_axes_of_the_body_are_turned_into_those_of_the_map() -> None:
     assert rotate(ATTITUDE, np.array((1.0, 0.0, 0.0))) == pytest.approx((0.0, 1.0, 0.0))
     assert rotate(ATTITUDE, np.array((0.0, 1.0, 3.0))) == pytest.approx((-1.0, 0.0, 3.0))
+
+
+@pytest.mark.ros
+def test_odometry_of_one_publisher_is_used_until_it_is_silent(tmp_path: Path) -> None:
+    with ros_domain() as domain, ExitStack() as stack:
+        nodes = [stack.enter_context(graph_in(domain, tmp_path)).node for _ in range(3)]
+        intake = Intake()
+        odometry = VehicleOdometry(nodes[0], VehicleSettings(odometry_topic="/odom"), intake)
+        stack.callback(odometry.feed.close)
+        swarm = make_swarm(SwarmConfig(agents=2), None, local=[1])
+        first, second = (node.create_publisher(Odometry, "/odom", 1) for node in nodes[1:])
+        wait_for(lambda: first.get_subscription_count() and second.get_subscription_count())
+
+        def x_after(*publishers: tuple[Publisher, float]) -> float:
+            for publisher, x in publishers:
+                message = Odometry()
+                message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
+                publisher.publish(message)
+            time.sleep(0.02)
+            odometry.sense(swarm)
+            return float(swarm.position[0, 0])
+
+        wait_for(lambda: x_after((first, 1.0)) == 1.0)
+        # Each in its turn, for the feed keeps the last message.
+        wait_for(lambda: x_after((first, 1.0)) == x_after((second, 1.2)) == 1.0 and intake.counts[OTHER_SENDER])
+        wait_for(lambda: x_after((second, 1.2)) == 1.2)
 
 
 @pytest.mark.ros

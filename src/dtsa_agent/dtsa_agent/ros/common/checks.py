@@ -33,7 +33,6 @@ FORGED_END = "forged end"
 LARGEST_SLOT = names.FIRST_CALL - 1  # 248 days of 10 ms slots
 FARTHEST_M = 1e6  # no vehicle is farther from the room's centre, or faster, than this many m or m/s
 FARTHEST_ODOMETRY_M, FASTEST_ODOMETRY_MPS = 1000.0, 100.0  # of vehicles that really fly
-_SILENT_S = 0.3  # after such a silence another publisher may take over
 _LONGEST_TEXT, _LONGEST_NAME, _LONGEST_LINE = 65536, 200, 300  # characters
 _MOST_REASONS = 64
 _LOG_S = 5.0  # from one line in the log to the next
@@ -70,28 +69,6 @@ class Intake:
             yield
         except BadMessage as error:
             self.drop(error.reason, str(error))
-
-
-class PublisherGuard:
-    """Admits the messages of one publisher: of a given sender, or of the first one until it has been silent.
-
-    Where a middleware does not name senders this is off.
-    """
-
-    __slots__ = ("_only", "_sender", "_time_s")
-
-    def __init__(self, sender: bytes | None = None) -> None:
-        self._only = self._sender = sender
-        self._time_s = 0.0
-
-    def admits(self, now_s: float, sender: bytes | None) -> bool:
-        """Return whether a message may be the next one of the publisher (``now_s``: s, monotonic)."""
-        if sender is None:
-            return True
-        if sender != self._sender and (self._only is not None or now_s - self._time_s < _SILENT_S):
-            return False
-        self._sender, self._time_s = sender, now_s
-        return True
 
 
 def check_slot(message: Any, agents: int) -> None:
