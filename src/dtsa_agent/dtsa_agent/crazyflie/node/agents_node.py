@@ -121,7 +121,7 @@ class BridgedVehicle(AgentVehicle):
     def fly(self, swarm: Swarm, slot: int) -> None:
         if slot % self._every:
             return
-        steer(swarm, slot, self._fence, self._stop_order.way_apart(swarm))
+        steer(swarm, slot, self._fence, self._stop_order.offset_apart(swarm))
         if self._odometry.is_fresh:
             message = VelocityWorld()
             message.vel.x, message.vel.y, message.vel.z = swarm.command[:, 0].tolist()
@@ -135,8 +135,8 @@ class StopOrder:
         self._swarms, self._stopping = swarms, False
         self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=intake)
 
-    def way_apart(self, swarm: Swarm) -> NDArray[np.float64] | None:
-        """Return the way (m, (3, 1)) of an agent to where its vehicle comes to rest; None: it flies on."""
+    def offset_apart(self, swarm: Swarm) -> NDArray[np.float64] | None:
+        """Return how far (m, (3, 1)) from an agent its vehicle comes to rest; None: it flies on."""
         self._stopping |= self._stop_here.take() is not None
         if not self._stopping:
             return None
