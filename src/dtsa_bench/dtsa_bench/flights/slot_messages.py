@@ -30,7 +30,7 @@ _RECEPTION = CdrMessage({
 @lru_cache(256)
 def _decision(count: int) -> CdrMessage:
     """Decision messages with this many names of reasons."""
-    texts = dict.fromkeys((f"name {place}" for place in range(count)), "*B")
+    texts = dict.fromkeys((f"name_{place}" for place in range(count)), "*B")
     return CdrMessage({
         "run": "I", "slot": "I", "agent": "*H", "chosen": "*H", "names": "I", **texts, "index": "*B", "reason": "*B",
         "digest": "*I", "score": "*d",
