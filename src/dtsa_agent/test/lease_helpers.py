@@ -10,7 +10,7 @@ import pytest
 
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig
 from dtsa_agent.core.frame import ExtendedFrame, decode_extended, encode_extended
-from dtsa_agent.core.reference.lease.memory import Memory
+from dtsa_agent.core.reference.lease import Memory
 from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_agent.core.reference.table import Rules
 

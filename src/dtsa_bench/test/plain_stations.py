@@ -86,7 +86,7 @@ class PlainStations:
     def _open(self, call: Any) -> reference.Station:
         c, flight, host = self._c.station, self.flight, call.host
         index = call.answer - 1
-        agent = Agent(index, rules_of(flight), Table(index + 1, self._start, self._away))
+        agent = Agent(Table(index + 1, rules_of(flight), self._start, self._away))
         agent.position, agent.goal = self._start[index], self._away[index]
         link = datagram.Link(bytes(c.link.header), True, c.link.names, c.link.flight_ns, c.link.trust_ns)
         begins_ns = None

@@ -20,11 +20,10 @@ from dtsa_agent.core.settings.flight_models import flight_model
 from dtsa_agent.core.settings.scenario import Scenario, policy_key
 from dtsa_agent.core.swarm import Bytes, Swarm
 
-from .agent import Agent, Foreign, hear, parse
+from .agent import Agent, Foreign, parse
 from .arithmetic import Vector
-from .estimators import ESTIMATORS
-from .lease.memory import DEAF
-from .table import Rules, Table
+from .lease import DEAF
+from .table import ESTIMATORS, Rules, Table
 
 
 def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
@@ -50,9 +49,7 @@ class ReferenceSwarm(Swarm):
         super().__init__(config, scenario, local)
         self.rules = rules_of(config, self.scenario)
         start = _vectors(self.scenario.start)
-        by_innovation = config.policy == "innovation"
-        tables = [Table(int(k) + 1, start, by_innovation=by_innovation) for k in self.local]
-        self.agents = [Agent(table.observer - 1, self.rules, table) for table in tables]
+        self.agents = [Agent(Table(agent, self.rules, start)) for agent in self.ids]
         for place in range(len(self.agents)):
             self._publish(place)
 
@@ -101,15 +98,12 @@ class ReferenceSwarm(Swarm):
             self.rejects[int(isinstance(error, Foreign))] += 1
             return False
         self._read_arrays()
-        extended = self.config.extended
-        reached = [
-            place
-            for place, agent in enumerate(self.agents)
-            if (mask is None or mask[place])
-            and not (extended and (agent.index + 1 == frame.own.sender or not (agent.present or self.shares)))
-        ]
-        hear([self.agents[place] for place in reached], frame, sampled, self.rules)
-        for place in reached:
+        for place, agent in enumerate(self.agents):
+            if mask is not None and not mask[place]:
+                continue
+            if self.config.extended and (agent.index + 1 == frame.own.sender or not (agent.present or self.shares)):
+                continue
+            agent.hear(frame, sampled)
             self._publish(place)
         return True
 

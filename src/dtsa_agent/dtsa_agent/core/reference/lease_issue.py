@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, field, replace
 
 from dtsa_agent.core.frame import ExtendedFrame, Frame
-from dtsa_agent.core.reference.arithmetic import Vector, minus, norm, norm1
-from dtsa_agent.core.reference.frame import FAR_REACH, LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH, SECTION_BYTES
-from dtsa_agent.core.reference.table import Table
 
-from .memory import HANDED, MISSED, Lease, Memory
+from .arithmetic import Vector, minus, norm, norm1
+from .frame import FAR_REACH, LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH, SECTION_BYTES
+from .lease import HANDED, MISSED, Lease, Memory
+from .table import Table
 
 NEED, MAX_NEED = 50.0, 6000.0  # NEED: s/m
 HAND_ON_FACTOR = 2  # a mover hands on turns that are worth so many times as much to another agent
