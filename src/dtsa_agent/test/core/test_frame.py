@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 
 import pytest
+from frame_helpers import encode_extended
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core import Frame, LocalProtocolError, RemoteProtocolError, decode_frame, encode_frame
-from dtsa_agent.core.frame import ExtendedFrame, encode_extended, named_in
+from dtsa_agent.core.frame import ExtendedFrame, named_in
 
 # Written down by hand from the layout in docs/reference/protocol.md: header 10 or 11, id, c_r, slot, position / 2 mm,
 # velocity / 1 cm/s in 12 bits each, low nibble first.

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
+from frame_helpers import encode_extended
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core import Frame, LocalProtocolError, RemoteProtocolError, encode_frame
-from dtsa_agent.core.frame import EXTENDED_LENGTH, ExtendedFrame, Gossip, decode_extended, encode_extended
+from dtsa_agent.core.frame import EXTENDED_LENGTH, ExtendedFrame, Gossip, decode_extended
 from dtsa_agent.core.reference import frame as plain
 
 OWN = Frame(3, 17, 1, (1.0, 2.0, -3.0), (0.5, -0.5, 0.0), (1.0, 0.0, 0.0))

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_helpers import encode_extended
 from lease_helpers import FAR, STATEMENTS, Air, is_anchor, make, still
 
 from dtsa_agent.core import REASONS, ConfigError, Scenario, Swarm, SwarmConfig, make_scenario
-from dtsa_agent.core.frame import OPEN, ExtendedFrame, Frame, Gossip, decode_extended, encode_extended
+from dtsa_agent.core.frame import OPEN, ExtendedFrame, Frame, Gossip, decode_extended
 from dtsa_agent.core.reference.lease import Memory, uses_open_turn
 from dtsa_agent.core.reference.lease_issue import open_block
 from dtsa_agent.core.reference.table import Rules

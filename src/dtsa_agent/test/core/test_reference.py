@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_helpers import encode_extended
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from kernel_parts import priority, select
 
 from dtsa_agent.core import REASONS, Frame, Swarm, SwarmConfig, decode_frame, encode_frame
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
-from dtsa_agent.core.frame import TAG_LENGTH, ExtendedFrame, Gossip, decode_extended, encode_extended, position_step
+from dtsa_agent.core.frame import TAG_LENGTH, ExtendedFrame, Gossip, decode_extended, position_step
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference import arithmetic, frame, policies
 from dtsa_agent.core.reference.frame import tag

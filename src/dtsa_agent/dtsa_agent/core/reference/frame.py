@@ -127,14 +127,6 @@ def decode(data: bytes, position_step: float) -> Frame:
     return Frame(sender, slot, c_r, position, velocity, None if profile == PROFILE_PAPER else intent)
 
 
-def sender_and_slot(data: bytes) -> tuple[int, int] | None:
-    """The sender's id and the slot that some bytes name, before they are decoded; None: they cannot be a frame."""
-    if len(data) < 8 or data[0] >> 4 != VERSION or data[0] & 0xF not in LENGTHS:
-        return None
-    _, _, sender, _, slot = unpack(data, OWN_BITS[:5])
-    return data[1] if data[0] & 0xF == PROFILE_EXTENDED else sender, slot
-
-
 def condition_of(data: bytes) -> tuple[bool, bool, bool]:
     """Whether a frame's sender leaves, rests, is on probation; extended frames alone say the first and the last."""
     if data[0] & 0xF != PROFILE_EXTENDED:
