@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm
 from dtsa_agent.core.kernel import ffi, lib, memory
-from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
@@ -54,7 +54,7 @@ def may_share(run: RunConfig) -> bool:
     """
     air, longest_ns = run.air, run.air.airtime.total_ns(run.air.airtime.longest)
     is_lossless = not any(getattr(air, name) for name in _LOSSES) and longest_ns <= air.slot_ns
-    return is_lossless and can_share_table(run.swarm)
+    return is_lossless and run.swarm.may_share_table
 
 
 class FlightMetrics:
