@@ -1,14 +1,6 @@
-"""Policies, estimators and avoiders from other packages, found by entry point. See docs/reference/plug-ins.md.
+"""Policies, estimators and avoiders from other packages: made, checked, called. See docs/reference/plug-ins.md.
 
-A package declares them in its metadata::
-
-    [project.entry-points."dtsa.policies"]
-    reverse = "my_package:Reverse"
-
-and then ``policy="reverse"`` works everywhere: in `simulate`, `sweep` and in the nodes. The entry point is a factory,
-called once for every observer as ``factory(config, agent)`` (agent: its id, 0 for tables that hear everything). It
-returns an object with the methods that docs/reference/plug-ins.md lists. An error that it raises, or a wrong return
-value, becomes a PluginError with its name.
+An error that a plug-in raises, or a wrong return value, becomes a PluginError with its name.
 """
 
 from __future__ import annotations

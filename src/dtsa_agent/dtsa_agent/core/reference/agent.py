@@ -15,6 +15,7 @@ from .arithmetic import ZERO, Vector, minus, norm
 from .frame import (
     OPEN,
     PROFILE_EXTENDED,
+    PROFILE_PAPER,
     SECTION_BYTES,
     SECTIONS,
     WRONG_HEADER,
@@ -26,7 +27,7 @@ from .frame import (
 )  # fmt: skip
 from .lease_issue import announce_turns
 from .policies import NOBODY, Choice
-from .table import EXTENDED, LEAVES, OFF, ON, PAPER, Rules, Table
+from .table import LEAVES, OFF, ON, Rules, Table
 
 
 @dataclass(slots=True)
@@ -85,9 +86,9 @@ class Agent:
         """The frame that the agent sends in a slot."""
         rules = self.rules
         c_r = rules.c_r if self.far_from_goal() else 0
-        intent = None if rules.profile == PAPER else self.command
+        intent = None if rules.profile == PROFILE_PAPER else self.command
         own = Frame(self.index + 1, rules.slot_on_air(slot), c_r, self.position, self.velocity, intent)
-        if rules.profile != EXTENDED:
+        if rules.profile != PROFILE_EXTENDED:
             return encode(own, rules.position_step)
         frame = ExtendedFrame(own)
         if rules.policy == "lease":
@@ -142,7 +143,7 @@ def parse(data: bytes, slot: int, rules: Rules) -> tuple[ExtendedFrame, int]:
     :raises RemoteProtocolError: if they are no frame of the swarm's kind.
     :raises Foreign: for a frame of an unknown agent or of another time.
     """
-    if rules.profile == EXTENDED:
+    if rules.profile == PROFILE_EXTENDED:
         frame = decode_extended(data, rules.position_step)
     else:
         frame = ExtendedFrame(decode(data, rules.position_step))
@@ -152,7 +153,7 @@ def parse(data: bytes, slot: int, rules: Rules) -> tuple[ExtendedFrame, int]:
     sampled = slot - (own.slot != rules.slot_on_air(slot))
     if sampled < 0 or own.slot != rules.slot_on_air(sampled) or own.sender > rules.agents:
         raise Foreign
-    if rules.profile == EXTENDED and not fits_swarm(frame, sampled, rules):
+    if rules.profile == PROFILE_EXTENDED and not fits_swarm(frame, sampled, rules):
         raise Foreign
     return frame, sampled
 

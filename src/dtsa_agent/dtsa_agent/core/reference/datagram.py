@@ -13,7 +13,7 @@ from typing import NamedTuple
 from dtsa_agent.core.frame import named_in
 
 from .frame import LENGTHS, TAG_LENGTH, Refused, decode, tag
-from .table import PROFILES, Rules
+from .table import Rules
 
 ACCEPTED, NOT_OURS, WRONG_LENGTH, OTHER_SETTINGS, NO_FRAME, UNKNOWN_AGENT = range(6)
 REJECTED, REPEATED, OTHER_TIME, SAME_ID, TOO_EARLY = range(6, 11)  # what became of a datagram
@@ -71,7 +71,7 @@ def parse_datagram(data: bytes, c: Settings, rules: Rules) -> Parsed | int:
         return WRONG_LENGTH
     if data[:agreed] != link.header:
         return OTHER_SETTINGS
-    if len(data) != head + LENGTHS[PROFILES.index(rules.profile)] + (TAG_LENGTH if c.key else 0):
+    if len(data) != head + LENGTHS[rules.profile] + (TAG_LENGTH if c.key else 0):
         return WRONG_LENGTH
     times, frame = data[agreed:head], data[head:]
     named = named_in(frame)

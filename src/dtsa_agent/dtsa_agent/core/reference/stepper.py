@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.core.frame import position_step
-from dtsa_agent.core.registry import PROFILES, REASONS
+from dtsa_agent.core.registry import REASONS
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.flight_models import flight_model
 from dtsa_agent.core.settings.scenario import Scenario, policy_key
@@ -31,7 +31,6 @@ def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
     same = {field.name: getattr(config, field.name) for field in fields(Rules) if hasattr(config, field.name)}
     return Rules(**{
         **same, "tau": flight_model(config.avoider, config.options).vehicle.tau, "key": policy_key(config.seed),
-        "profile": PROFILES[config.profile],
         "position_step": position_step(config.extent_m), "open_every": config.open_period,
         "targets_known": config.targets_known and scenario.goals_known,
     })  # fmt: skip

@@ -13,10 +13,9 @@ from functools import lru_cache
 from dtsa_agent.core.frame import Frame, Gossip
 
 from .arithmetic import ZERO, Vector, bits_of, minus, mix64, norm1
-from .frame import GOSSIP_AGE_MAX, SECTIONS, gossip_fits
+from .frame import GOSSIP_AGE_MAX, PROFILE_PAPER, SECTIONS, gossip_fits
 
 OFF, ON, LEAVES = 0, 1, 2  # of an agent: not there, there, about to be switched off
-PROFILES = PAPER, PAPER_INTENT, EXTENDED = "paper", "paper-intent", "extended"  # of frames
 DECAY_STEPS = 4096  # beyond this many control periods a vehicle has settled at its command
 
 
@@ -37,7 +36,7 @@ class Rules:
     boot_round: bool = True
     return_every: int = 20
     # frames
-    profile: str = PAPER
+    profile: int = PROFILE_PAPER
     position_step: float = 0.002  # m
     r_min: float = 0.3  # m, eq:remaining_t_slots
     c_r: int = 1  # C, eq:remaining_t_slots

@@ -203,24 +203,19 @@ class Settings:
 
         :raises ConfigError: for unknown names and values that are not allowed.
         """
-        return build(cls, values)
-
-
-def build(cls: type[T], values: Mapping[str, Any]) -> T:
-    """What :meth:`Settings.from_dict` does, for classes that read their values in a way of their own first."""
-    specs = {spec.name: spec for spec in settings_of(cls)}
-    arguments = dict(names_with_values(values, "settings"))
-    for name, value in arguments.items():
-        if name not in specs:
-            raise ConfigError(str(name), value, SETTING_NAMES + ", ".join(specs))
-        section = specs[name].section
-        if section and isinstance(value, Mapping):
-            with named(name):
-                arguments[name] = section.from_dict(value)
-    for spec in specs.values():
-        if spec.required and spec.name not in arguments:
-            raise ConfigError(spec.name, None, spec.allowed)
-    return cls(**arguments)
+        specs = {spec.name: spec for spec in settings_of(cls)}
+        arguments = dict(names_with_values(values, "settings"))
+        for name, value in arguments.items():
+            if name not in specs:
+                raise ConfigError(str(name), value, SETTING_NAMES + ", ".join(specs))
+            section = specs[name].section
+            if section and isinstance(value, Mapping):
+                with named(name):
+                    arguments[name] = section.from_dict(value)
+        for spec in specs.values():
+            if spec.required and spec.name not in arguments:
+                raise ConfigError(spec.name, None, spec.allowed)
+        return cls(**arguments)
 
 
 def check(config: Any) -> None:
