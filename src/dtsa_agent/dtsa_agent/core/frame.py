@@ -103,11 +103,11 @@ def encode_frame(frame: Frame, extent_m: float = EXTENT_M) -> bytes:
 
 
 def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:
-    """The fields of a frame that all profiles have.
+    """The fields of a frame that all profiles have, and the intent where it is carried.
 
     :raises RemoteProtocolError: if the bytes are no frame: sealed ones are opened first.
     """
-    return _frame_of(_decode("dtsa_frame *", lib.frame_decode, data, extent_m), PROFILE_PAPER_INTENT)
+    return _frame_of(_decode("dtsa_frame *", lib.frame_decode, data, extent_m))
 
 
 def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
@@ -120,7 +120,7 @@ def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
     gossip = tuple(Gossip(g.id, g.age, bool(g.c_r), _vector(g.p), _vector(g.v)) for g in entries)
     far = int.from_bytes(bytes(record.far_mask), "little")
     return ExtendedFrame(
-        _frame_of(record.own, PROFILE_EXTENDED), record.c_s, bool(record.leaving), bool(record.probation), gossip,
+        _frame_of(record.own), record.c_s, bool(record.leaving), bool(record.probation), gossip,
         bytes(record.leases)[: record.lease_count],
         tuple(zip(_slots_of(record.relay_mask, _NEAR), record.relay_ids, strict=False)),
         _slots_of(far, _FAR), record.far_id,
@@ -139,8 +139,8 @@ def _decode(record_type: str, decode: Any, data: bytes, extent_m: float) -> Any:
     return record
 
 
-def _frame_of(record: Any, with_intent: int) -> Frame:
-    intent = _vector(record.c) if record.profile == with_intent else None
+def _frame_of(record: Any) -> Frame:
+    intent = None if record.profile == PROFILE_PAPER else _vector(record.c)
     return Frame(record.sender, record.slot, record.c_r, _vector(record.p), _vector(record.v), intent)
 
 
