@@ -99,9 +99,8 @@ class PluginSwarm(Swarm):
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
-        self._ids = [int(index) + 1 for index in self.observer]
-        self.tables = [Table(self, row) for row in range(len(self._ids))]  # of each observer
-        self._outcome = np.zeros(len(self._ids), dtype=np.uint8)  # SlotOutcome of this slot, without collisions
+        self.tables = [Table(self, row) for row in range(len(self.observer))]  # of each observer
+        self._outcome = np.zeros(len(self.tables), dtype=np.uint8)  # SlotOutcome of this slot, without collisions
         self._appended: dict[int, bytes] = {}  # own data of this slot's frames, by position in ids
         self._own_bytes = self.config.own_bytes
         self._make_parts()
@@ -111,7 +110,7 @@ class PluginSwarm(Swarm):
         self._genie = self._make_part(REGISTRIES["policy"], 0) if has_genie else None
         #: Plug-ins of each observer; empty if the part is built in, or the policy is a genie.
         self.policies, self.estimators, self.avoiders = (
-            self._make_instances(registry, self._ids) for registry in REGISTRIES.values()
+            self._make_instances(registry, [table.agent for table in self.tables]) for registry in REGISTRIES.values()
         )
         self.flies_in_c = not (self.estimators or self.avoiders)
         self._list_data_parts()
@@ -131,7 +130,7 @@ class PluginSwarm(Swarm):
         policy, estimator = self.config.policy_row, self.config.estimator_row
         parts = ((self.policies, policy.own_bytes), (self.estimators, estimator.own_bytes))
         self._data_parts = [
-            [(instances[row], size) for instances, size in parts if instances] for row in range(len(self._ids))
+            [(instances[row], size) for instances, size in parts if instances] for row in range(len(self.tables))
         ]
         self._needs_outcome = any(hasattr(part, "slot_over") for row in self._data_parts for part, _ in row)
 
@@ -176,14 +175,14 @@ class PluginSwarm(Swarm):
         if not (self._own_bytes or self._needs_outcome):
             return True
         sender = decode_frame(frame[:end]).sender
-        for row, agent in enumerate(self._ids):
-            if agent == sender or (mask is not None and not mask[row]):
+        for row, table in enumerate(self.tables):
+            if table.agent == sender or (mask is not None and not mask[row]):
                 continue
             self._outcome[row] = SlotOutcome.FRAME
             offset = end
             for part, size in self._data_parts[row]:
                 if size:
-                    part.receive_data(self.tables[row], slot, sender, frame[offset : offset + size])
+                    part.receive_data(table, slot, sender, frame[offset : offset + size])
                 offset += size
         return True
 
