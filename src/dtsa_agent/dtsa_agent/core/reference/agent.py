@@ -43,20 +43,13 @@ class Agent:
     present: int = ON
     sends: bool = False  # in this slot
     choice: Choice = NOBODY  # of this slot
+    rules: Rules = field(init=False)
+    index: int = field(init=False)  # id - 1
     memory: lease.Memory = field(init=False)
 
     def __post_init__(self) -> None:
+        self.rules, self.index = self.table.rules, self.table.observer - 1
         self.memory = lease.Memory(self.rules, self.index)
-
-    @property
-    def rules(self) -> Rules:
-        """What all agents agree on."""
-        return self.table.rules
-
-    @property
-    def index(self) -> int:
-        """Its id - 1."""
-        return self.table.observer - 1
 
     def restart(self) -> None:
         """Its program starts anew, knowing nothing but its settings; where it is and flies stays."""
