@@ -22,7 +22,7 @@ from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.ros.common.checks import OTHER_SENDER, Intake
 from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, VehicleOdometry, VehicleSettings, rotate
 from dtsa_bench.flights.domain import ros_domain
