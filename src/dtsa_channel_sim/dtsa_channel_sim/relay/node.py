@@ -90,7 +90,7 @@ class Relay:
                 accept, source = partial(self._accept_odometry, row), full_name(name, robot.odometry, "odometry")
                 self._follow("nav_msgs/msg/Odometry", source, accept, reliability=ReliabilityPolicy.BEST_EFFORT)
             elif robot.tf:
-                self._frames[row] = robot.tf
+                self._frames[row], self._positions[:, row] = robot.tf, self._tree.place_of(robot.tf)
             else:
                 self._positions[:, row] = robot.place or 0.0  # 0: it does not matter
         if self._frames:
