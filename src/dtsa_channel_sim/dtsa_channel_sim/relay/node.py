@@ -95,8 +95,8 @@ class Relay:
                 self._positions[:, row] = robot.place or 0.0  # 0: it does not matter
         if self._frames:
             static = DurabilityPolicy.TRANSIENT_LOCAL
-            self._follow("tf2_msgs/msg/TFMessage", "/tf", self._accept_transforms)
-            self._follow("tf2_msgs/msg/TFMessage", "/tf_static", self._accept_transforms, durability=static)
+            self._follow("tf2_msgs/msg/TFMessage", "/tf", self._tree.accept)
+            self._follow("tf2_msgs/msg/TFMessage", "/tf_static", self._tree.accept, durability=static)
 
     def run(self, stop: Stop) -> None:
         """Relay until a signal."""
@@ -106,10 +106,7 @@ class Relay:
         while not stop and self._node.context.ok():
             wait_s = (self._transport.due_ns - self._update_time()) / 1e9
             executor.spin_once(timeout_sec=min(_MAX_WAIT_S, max(_MIN_WAIT_S, wait_s)))
-            for feed, accept in self._feeds:
-                for message in itertools.islice(iter(feed.take, None), _DEPTH):
-                    with self._intake.guard():
-                        accept(message)
+            self._update_positions()
             for message, received in self._transport.advance(self._update_time(), self._positions):
                 publishers, data = message.payload
                 for row in np.flatnonzero(received).tolist():
@@ -136,16 +133,27 @@ class Relay:
         check_numbers("places", place := (position.x, position.y, position.z))
         self._positions[:, row] = place
 
-    def _accept_transforms(self, message: Any) -> None:
-        self._tree.accept(message)
-        for row, frame in self._frames.items():
+    def _update_positions(self) -> None:
+        is_changed = False
+        for feed, accept in self._feeds:
+            for message in itertools.islice(iter(feed.take, None), _DEPTH):
+                is_changed = True
+                with self._intake.guard():
+                    accept(message)
+        for row, frame in self._frames.items() if is_changed else ():
             self._positions[:, row] = self._tree.place_of(frame)
 
     # Messages.
 
     def _tick(self, tick: int) -> None:
-        """Look for topics; now and then say what is missing, and how pairs are doing."""
-        self._awaited = [topic for topic in self._awaited if not self._open(topic)]
+        """Relay topics that have a publisher by now; now and then say what is missing, and how pairs are doing."""
+        for topic in self._awaited.copy():
+            if sources := self._node.get_publishers_info_by_topic(topic.source):
+                self._awaited.remove(topic)
+                try:
+                    self._relay(topic, sources)
+                except ConfigError as error:
+                    self._logger.error(f"{topic.source}: {error}")
         missing = [topic.source for topic in self._awaited]
         missing += [f"the place of {self._names[row]}" for row in np.flatnonzero(np.isnan(self._positions[0]))]
         if tick % _REMIND_TICKS == _REPORT_TICKS:
@@ -153,16 +161,6 @@ class Relay:
                 self._logger.info(f"waits for {text}")
         if tick % _REPORT_TICKS == 0:
             self._report(f"waits for {', '.join(missing)}" if missing else "relays")
-
-    def _open(self, topic: RelayedTopic) -> bool:
-        """Relay a topic if it has a publisher; return whether nothing is left to do."""
-        sources = self._node.get_publishers_info_by_topic(topic.source)
-        if sources:
-            try:
-                self._relay(topic, sources)
-            except ConfigError as error:
-                self._logger.error(f"{topic.source}: {error}")
-        return bool(sources)
 
     def _relay(self, topic: RelayedTopic, sources: Sequence[TopicEndpointInfo]) -> None:
         type_name = sources[0].topic_type
