@@ -19,7 +19,7 @@ _HOMES = {
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "PluginError", "RemoteProtocolError",
         "SlotOutcome", "SwarmConfig", "plug_in_random",
     ),
-    "dtsa_agent.core.plugins.entry_points": ("Table",),
+    "dtsa_agent.core.plugins": ("Table",),
     "dtsa_agent.core.registry": ("REASONS",),
     "dtsa_bench.log.bag.errors": ("BagError", "UnusableBag"),
     "dtsa_bench.drawing.palette": ("agent_colour",),

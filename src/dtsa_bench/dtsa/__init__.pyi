@@ -10,7 +10,7 @@ from dtsa_agent.core import RemoteProtocolError as RemoteProtocolError
 from dtsa_agent.core import SlotOutcome as SlotOutcome
 from dtsa_agent.core import SwarmConfig as SwarmConfig
 from dtsa_agent.core import plug_in_random as plug_in_random
-from dtsa_agent.core.plugins.entry_points import Table as Table
+from dtsa_agent.core.plugins import Table as Table
 from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench import __version__ as __version__
 from dtsa_bench.drawing.palette import agent_colour as agent_colour

@@ -10,7 +10,7 @@ import pytest
 import dtsa
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import PluginError
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_bench.simulation.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
