@@ -83,7 +83,7 @@ class ParsedDatagram(NamedTuple):
 class Events(Protocol):
     """Recorder of what happens to a station."""
 
-    def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
+    def opened(self, slot: int, start_ns: int, is_first: bool) -> None:
         """A slot is open: the agent has decided."""
 
     def restarted(self, slot: int) -> None:
@@ -357,7 +357,7 @@ _callback(lambda s, slot: s.swarm.end(slot), "station_close")
 _callback(lambda s: s.swarm.restart(0), "station_restart")
 _callback(Station.leave_air, "station_leave")
 _callback(Station.probation, "station_on_probation")
-_callback(lambda s, slot, start, now, first: s.events.opened(slot, start, now, bool(first)), "station_opened")
+_callback(lambda s, slot, start, _, first: s.events.opened(slot, start, bool(first)), "station_opened")
 _callback(lambda s, slot: s.events.restarted(slot), "station_restarted")
 _callback(
     lambda s, sender, slot, data, n, arrival, ok: s.events.heard(sender, slot, _bytes(data, n), arrival, bool(ok)),

@@ -125,7 +125,7 @@ class RealtimeAgent:
 
     # Events of the station.
 
-    def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
+    def opened(self, slot: int, start_ns: int, is_first: bool) -> None:
         self._opened = True
 
     def restarted(self, slot: int) -> None:

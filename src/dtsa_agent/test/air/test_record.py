@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.air.port import link_of
-from dtsa_agent.air.record import Reports
+from dtsa_agent.air.record import AgentReports
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 from dtsa_agent.core.station import ALL_BUT_ONE, STATES, HoverReason, Station, StationSettings
@@ -57,7 +57,7 @@ def status(hovers: int, hears: int, heard_by: int, state: int = 2) -> SimpleName
 
 def test_a_state_that_lasts_is_printed_once() -> None:
     lines: list[str] = []
-    reports = Reports(1, 10.0, lines.append, 0)
+    reports = AgentReports(1, 10.0, lines.append, 0)
     reports.status(status(HoverReason.IS_NEW, 2, 1), SECOND // 2)
     reports.status(status(HoverReason.NONE, 5, 5), SECOND)
     assert lines == []  # a start takes a moment
@@ -78,7 +78,7 @@ def test_a_state_that_lasts_is_printed_once() -> None:
 
 def test_an_agent_that_hears_nobody_says_that_it_is_alone() -> None:
     lines: list[str] = []
-    reports = Reports(1, 10.0, lines.append, 0)
+    reports = AgentReports(1, 10.0, lines.append, 0)
     for second in range(10):
         reports.status(status(HoverReason.NO_QUORUM, 0, 0, STATES.index("alone")), second * SECOND)
     assert lines == ["is alone, and hovers until it hears others"]

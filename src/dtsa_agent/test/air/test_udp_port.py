@@ -19,7 +19,7 @@ import pytest
 
 from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.port import ClockMap, ReceivedDatagram, link_of
-from dtsa_agent.air.record import AgentCounts, Reports, SlotRecord
+from dtsa_agent.air.record import AgentReports, SlotRecord
 from dtsa_agent.air.settings import AgentSettings, UdpSettings
 from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, Frame, Swarm, SwarmConfig, encode_frame
@@ -139,11 +139,17 @@ STATUS = SimpleNamespace(
 )
 
 
+def flies(hears: int) -> SimpleNamespace:
+    return SimpleNamespace(
+        hovers=HoverReason.NONE, others=2, hears=hears, heard_by=2, needed=1, state=2, timed=0, off=0
+    )
+
+
 def test_the_counts_knows_how_late_frames_left() -> None:
-    counts = AgentCounts()
+    counts = AgentReports(1, 10.0, None, 0)
     assert counts.summary(STATUS, (0, 0))["sends_on_time_share"] is None
     for late in (0, 50_000, 60_000, 3_000_000):
-        counts.add_sent(late)
+        counts.sent(late, 0)
     found = counts.summary(SimpleNamespace(**vars(STATUS) | {"sent": 4}), (0, 0))
     assert found["sends_on_time_share"] == 0.75
     assert found["send_late_ms"] == {"p50": pytest.approx(0.05, rel=0.05), "p99": 3.0, "max": 3.0}
@@ -176,8 +182,8 @@ def test_what_the_network_refuses_does_not_count_as_sent(monkeypatch: pytest.Mon
         agent.run(stop)
         found = agent.summary()
     assert found["unsent_because"][os.strerror(number)] == 3
-    with_frames = [record for record in slots if record.frame]
-    assert all((record.sent_ns, record.datagram) == (-1, b"") for record in with_frames[:3])
+    own_turns = [record for record in slots if record.chosen == 1]
+    assert all((record.sent_ns, record.datagram) == (-1, b"") for record in own_turns[:3])
     sent = [record for record in slots if record.datagram]
     assert len(sent) == found["sent"] > 0
     assert all(record.sent_ns > 0 for record in sent)
@@ -197,13 +203,12 @@ def test_other_settings_and_another_key_are_said_in_flight() -> None:
     strange = datagrams(config, Authenticator(KEY[::-1], 1)).write(frame, 7)
     lines: list[str] = []
     second, now = 1_000_000_000, [0]
-    reports = Reports(1, config.slot_ms, lines.append, 0)
-    flies = SimpleNamespace(hovers=HoverReason.NONE, others=2, hears=2, heard_by=2, needed=1, state=2, timed=0, off=0)
+    reports = AgentReports(1, config.slot_ms, lines.append, 0)
 
     def arrives(*data: bytes) -> list[str]:
         for one in data:
-            reports.foreign(here.read(one).fault, now[0])
-        reports.status(flies, now[0])
+            reports.refused(here.read(one).fault, now[0])
+        reports.status(flies(2), now[0])
         return [line for line in lines if "datagrams" in line]
 
     assert arrives(slow, strange, slow, b"noise" * 20) == []
@@ -235,11 +240,11 @@ def test_an_agent_goes_first_and_what_it_starts_does_not() -> None:
 
 
 def test_the_share_of_agents_heard_counts_from_when_it_could_fly() -> None:
-    counts = AgentCounts()
+    counts = AgentReports(1, 10.0, None, 0)
     found = counts.summary(STATUS, (0, 0))
     assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (None, None, None)
     for hears in (2, 1):
-        counts.add_contacts(2, hears)
+        counts.status(flies(hears), 0)
     found = counts.summary(STATUS, (63, 3))
     assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (0.75, 63, 3)
 

@@ -162,13 +162,9 @@ class TimingStatistics(ChannelObserver):
         for slot in sorted(self._open):
             self._sum_up(slot)
         frames = sum(sends.count for sends in self._away.values())
-        delays, receivers = self._delays, {"all": None, **{str(k + 1): k for k in range(self._agents)}}
+        receivers = {"all": None, **{str(k + 1): k for k in range(self._agents)}}
         return {
-            "delivery_ms": {
-                name: {"p50": delays.quantile_ms(0.5, k), "p99": delays.quantile_ms(0.99, k),
-                       "max": delays.largest_ms(k)}
-                for name, k in receivers.items()
-            },
+            "delivery_ms": {name: self._delays.quantiles_ms(k) for name, k in receivers.items()},
             "clock_spread_max_ms": self._spread_max / 1e6 if self._spreads else None,
             "clock_spread_mean_ms": self._spread_sum / self._spreads / 1e6 if self._spreads else None,
             "clock_spread_end_ms": max(self._last_spreads) / 1e6 if self._spreads else None,

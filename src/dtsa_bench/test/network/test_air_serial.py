@@ -202,7 +202,7 @@ def test_bytes_of_mavlink_are_told_and_the_bag_is_whole(tmp_path: Path) -> None:
             time.sleep(0.005)
         wait_for(lambda: any("MAVLink" in line for line in one.said))
         made.inject(1, to_line(b"a stranger's"))
-        wait_for(lambda: one.agent.counts.refused.total() > 0)
+        wait_for(lambda: one.agent.reports.not_taken_in.total() > 0)
         helpers.go_on([one], 10)
     bag = read(tmp_path / "cf1.mcap")
     assert not bag.broken_off
