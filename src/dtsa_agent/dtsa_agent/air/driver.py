@@ -19,11 +19,12 @@ from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.station import Station, StationSettings, check_joinable
 from dtsa_agent.core.swarm import Swarm
+from dtsa_agent.core.times import ClockMap
 from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.priority import realtime_thread, wake_precisely
 from dtsa_agent.stop import Stop
 
-from .port import ClockMap, Port, check_fits, link_of
+from .port import Port, check_fits, link_of
 from .record import AgentReports, ReceivedFrame, SlotRecord, SlotRecords, Watcher
 from .settings import AgentSettings
 

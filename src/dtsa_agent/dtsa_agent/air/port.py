@@ -18,10 +18,9 @@ the frame is. Times are integer ns, CLOCK_MONOTONIC unless said otherwise.
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -30,29 +29,11 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
 from dtsa_agent.core.station import BETWEEN, Link, Station
+from dtsa_agent.core.times import ClockMap
 
-_SECOND = 1_000_000_000
 _MAGIC = b"DT\x01\x00"
 _WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic
 _TRUST_NS = 1_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class ClockMap:
-    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift."""
-
-    offset_ns: int = 0  # by how much it is ahead at `began_ns`
-    drift_ppb: int = 0  # parts per billion by which it runs fast
-    began_ns: int = field(default_factory=time.monotonic_ns)
-
-    def local_ns(self, monotonic_ns: int) -> int:
-        """What the clock shows at a time of CLOCK_MONOTONIC."""
-        return monotonic_ns + self.offset_ns + (monotonic_ns - self.began_ns) * self.drift_ppb // _SECOND
-
-    def monotonic_ns(self, local_ns: int) -> int:
-        """The first ns of CLOCK_MONOTONIC at which the clock shows a time, or is past it."""
-        elapsed = local_ns - self.offset_ns - self.began_ns
-        return self.began_ns + elapsed - elapsed * self.drift_ppb // (_SECOND + self.drift_ppb)
 
 
 class Header(NamedTuple):

@@ -12,8 +12,9 @@ from typing import NamedTuple
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.station import Station
+from dtsa_agent.core.times import ClockMap
 
-from .port import ClockMap, Port, ReceivedDatagram
+from .port import Port, ReceivedDatagram
 from .settings import UdpSettings
 
 _SIOCGIFADDR = 0x8915

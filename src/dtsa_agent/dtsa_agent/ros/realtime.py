@@ -25,7 +25,6 @@ from dtsa_msgs.msg import Frame, Report, Slot
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core import station as core
 from dtsa_agent.core.agent import REFUSED
@@ -34,6 +33,7 @@ from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator
 from dtsa_agent.core.station import Link, Station, StationSettings
 from dtsa_agent.core.swarm import Presence
+from dtsa_agent.core.times import ClockMap
 from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import split_frames, unpack_received

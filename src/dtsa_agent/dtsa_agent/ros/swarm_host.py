@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 from rclpy.node import Node
 
-from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
 from dtsa_agent.core.settings.declaration import Setting, setting
+from dtsa_agent.core.times import ClockMap
 from dtsa_agent.keys import authenticator, with_key
 from dtsa_agent.priority import PrioritySettings, set_nice
 from dtsa_agent.ros.common import names

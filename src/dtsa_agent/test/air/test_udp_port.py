@@ -18,7 +18,7 @@ from unittest.mock import DEFAULT, MagicMock
 import pytest
 
 from dtsa_agent.air.driver import LiveAgent
-from dtsa_agent.air.port import ClockMap, ReceivedDatagram, link_of
+from dtsa_agent.air.port import ReceivedDatagram, link_of
 from dtsa_agent.air.record import AgentReports, SlotRecord
 from dtsa_agent.air.settings import AgentSettings, UdpSettings
 from dtsa_agent.air.udp_port import UdpPort
@@ -26,6 +26,7 @@ from dtsa_agent.core import ConfigError, Frame, Swarm, SwarmConfig, encode_frame
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.station import BETWEEN, HoverReason, Station, StationSettings
+from dtsa_agent.core.times import ClockMap
 from dtsa_agent.priority import realtime_thread
 from dtsa_agent.stop import Stop
 

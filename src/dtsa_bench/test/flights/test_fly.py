@@ -62,7 +62,7 @@ def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_pa
 def test_slots_of_a_clock_start_when_that_clock_says_so() -> None:
     from drifting_clocks import to_channel
 
-    from dtsa_agent.air.port import ClockMap
+    from dtsa_agent.core.times import ClockMap
 
     config = ClockConfig(offset_ns=2_000_000, drift_ppm=50.0, seed=3)
     clocks = make_clocks(config, 6)
