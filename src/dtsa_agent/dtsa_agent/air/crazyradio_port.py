@@ -248,7 +248,7 @@ class CrazyradioPort(DevicePort):
                 if datagram is None:
                     self._others += 1
                 else:
-                    self._queue(datagram, arrival_ns, False)
+                    self._queue(datagram, arrival_ns)
             if now >= counts_due_ns:
                 counts_due_ns = now + _COUNTS_NS
                 dropped = bytes(device.ctrl_transfer(VENDOR_IN, GET_SNIFFER_DROP_COUNT, 0, 0, 4, _REQUEST_MS))

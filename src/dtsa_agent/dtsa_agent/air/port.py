@@ -75,21 +75,17 @@ class PortProperties:
 
 
 class ReceivedDatagram(NamedTuple):
-    """A datagram that has arrived."""
+    """A datagram of another port that has arrived."""
 
     data: bytes
     arrival_ns: int
-    own: bool  # this very port has sent it
 
 
 P = TypeVar("P", bound="Port")
 
 
 class Port(ABC):
-    """What carries the datagrams of an agent with a clock of its own, or brings them to a listener. A context manager.
-
-    What it sends may come back to it, marked as its own.
-    """
+    """Carries the datagrams of an agent with a clock of its own, or brings them to a listener. A context manager."""
 
     properties: PortProperties
     log: Callable[[str], None] | None = None  # prints a line when the port fails or is back; its user sets it
@@ -109,7 +105,7 @@ class Port(ABC):
 
     @abstractmethod
     def receive(self, most: int) -> list[ReceivedDatagram]:
-        """Return what has arrived, in this order; empty if nothing has.
+        """Return what others have sent, in the order of arrival; empty if nothing has come.
 
         :param most: datagrams that are returned at most.
         :returns: each with its time of arrival, ns, CLOCK_MONOTONIC.
@@ -132,8 +128,7 @@ class Port(ABC):
         """
         datagrams = self.receive(most)
         for datagram in datagrams:
-            if not datagram.own:
-                station.receive(datagram.data, clock.local_ns(datagram.arrival_ns))
+            station.receive(datagram.data, clock.local_ns(datagram.arrival_ns))
         return len(datagrams)
 
     def print(self, text: str) -> None:

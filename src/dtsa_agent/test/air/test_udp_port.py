@@ -113,17 +113,18 @@ def test_stamps_of_a_clock_that_has_been_set_are_not_believed() -> None:
 
 def test_arrivals_are_exact_however_long_a_process_was_kept_waiting() -> None:
     """It stands still between two datagrams of one pass: the second one has arrived long after the first."""
-    with UdpPort(UdpSettings(interface="lo", group=f"239.255.77.77:{20_000 + os.getpid() % 10_000}")) as end:
+    settings = UdpSettings(interface="lo", group=f"239.255.77.77:{20_000 + os.getpid() % 10_000}")
+    with UdpPort(settings) as end, UdpPort(settings) as other:
         began, found = time.monotonic_ns(), list[ReceivedDatagram]()
         while not (found and found[-1].arrival_ns < time.monotonic_ns() - 40_000_000):
             assert time.monotonic_ns() - began < 10 * 10**9
-            end.send(b"w")  # the kernel notes times from a moment after the first socket has asked for them
+            other.send(b"w")  # the kernel notes times from a moment after the first socket has asked for them
             time.sleep(0.05)
             found = end.receive(16)
         sent = []
         for _ in range(2):
             sent.append(time.monotonic_ns())
-            end.send(b"x")
+            other.send(b"x")
             time.sleep(0.05)
         found = []
         while len(found) < 2:
