@@ -17,9 +17,8 @@ import numpy as np
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.station import Station, StationSettings, check_joinable
+from dtsa_agent.core.station import ClockMap, Station, StationSettings, check_joinable
 from dtsa_agent.core.swarm import Swarm
-from dtsa_agent.core.times import ClockMap
 from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.priority import realtime_thread, wake_precisely
 from dtsa_agent.stop import Stop
@@ -76,7 +75,7 @@ class LiveAgent:
         self.own, self.config, self.port, self.watcher = own, config, port, watcher
         self._settings = StationSettings(config, link, authenticator(config), own.id, own.quorum)
         self.swarm = make_swarm(config, local=[own.id])
-        self.clock = ClockMap(own.clock_offset_ns, own.clock_drift_ppb)
+        self.clock = ClockMap(own.clock_offset_ns, own.clock_drift_ppb, time.monotonic_ns())
         self._header = port.properties.header(config.auth) if port.properties.varies else None
         self._vehicle = vehicle or AgentVehicle()
         self.station = self._start()

@@ -28,8 +28,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
-from dtsa_agent.core.station import BETWEEN, Link, Station
-from dtsa_agent.core.times import ClockMap
+from dtsa_agent.core.station import BETWEEN, ClockMap, Link, Station
 
 _MAGIC = b"DT\x01\x00"
 _WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic

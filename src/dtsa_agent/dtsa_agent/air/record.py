@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.station import OTHER_SETTINGS, REJECTED, STATES, HoverReason, Station
 from dtsa_agent.core.swarm import Floats
-from dtsa_agent.core.times import Delays
 
 _SECOND = 1_000_000_000
 _ON_TIME_NS = 1_000_000

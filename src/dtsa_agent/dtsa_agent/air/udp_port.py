@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.station import Station
-from dtsa_agent.core.times import ClockMap
+from dtsa_agent.core.station import ClockMap, Station
 
 from .port import Port, ReceivedDatagram
 from .settings import UdpSettings

@@ -29,8 +29,27 @@ _, _, LENGTH, OTHER_SETTINGS, NO_FRAME, _, REJECTED, REPEATED, OTHER_TIME, _, TO
 STATES = ("listening", "alone", "joined")
 ALL_BUT_ONE = "all-but-one"
 QUORUMS = f"{ALL_BUT_ONE}, a share of the others (80%), or a number of them (0: it never hovers for this)"
+_SECOND = 1_000_000_000
 BETWEEN = lib.DTSA_BETWEEN / 1000  # of a slot, between a frame that left late and the next slot
 EARLY_COUNT = 64  # frames of slots still to come that are kept
+
+
+@dataclass(frozen=True, slots=True)
+class ClockMap:
+    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift."""
+
+    offset_ns: int = 0  # by how much it is ahead at `began_ns`
+    drift_ppb: int = 0  # parts per billion by which it runs fast
+    began_ns: int = 0  # CLOCK_MONOTONIC
+
+    def local_ns(self, monotonic_ns: int) -> int:
+        """What the clock shows at a time of CLOCK_MONOTONIC."""
+        return monotonic_ns + self.offset_ns + (monotonic_ns - self.began_ns) * self.drift_ppb // _SECOND
+
+    def monotonic_ns(self, local_ns: int) -> int:
+        """The first ns of CLOCK_MONOTONIC at which the clock shows a time, or is past it."""
+        elapsed = local_ns - self.offset_ns - self.began_ns
+        return self.began_ns + elapsed - elapsed * self.drift_ppb // (_SECOND + self.drift_ppb)
 
 
 class HoverReason(IntEnum):

@@ -25,8 +25,7 @@ from dtsa_agent.air.udp_port import UdpPort
 from dtsa_agent.core import ConfigError, Frame, Swarm, SwarmConfig, encode_frame
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.station import BETWEEN, HoverReason, Station, StationSettings
-from dtsa_agent.core.times import ClockMap
+from dtsa_agent.core.station import BETWEEN, ClockMap, HoverReason, Station, StationSettings
 from dtsa_agent.priority import realtime_thread
 from dtsa_agent.stop import Stop
 

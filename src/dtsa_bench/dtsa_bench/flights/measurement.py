@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
-from dtsa_agent.core.times import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import FlightMetrics, metrics_tables

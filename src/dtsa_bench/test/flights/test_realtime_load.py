@@ -15,7 +15,7 @@ from fly_helpers import FlightProcess, children, start_flight, summary_of, verif
 from node_helpers import ros_graph
 from process_helpers import addresses, may_be_real_time, real_time, segments_of
 
-from dtsa_agent.core.times import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import describe
 from dtsa_bench.flights.options import FlightOptions

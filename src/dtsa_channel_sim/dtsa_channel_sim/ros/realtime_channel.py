@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
+from dtsa_agent.core.delays import Delays
 from dtsa_agent.core.frame import named_in
-from dtsa_agent.core.times import Delays
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import ns_of
 from dtsa_agent.ros.common.checks import RANGE, SIZES, BadMessage, check_start

@@ -1,35 +1,14 @@
-"""The clock of an agent, and how long things took, in constant memory."""
+"""How long things took, in constant memory."""
 
 from __future__ import annotations
 
-import time
 from bisect import bisect_left
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-_SECOND = 1_000_000_000
 _BOUNDS = 1_000.0 * 1.05 ** np.arange(380)  # ns, 1 us to 107 s: a quantile is right to 5 %
 _SCALAR_BOUNDS = _BOUNDS.tolist()  # NumPy takes ten times as long for a single delay
-
-
-@dataclass(frozen=True, slots=True)
-class ClockMap:
-    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift."""
-
-    offset_ns: int = 0  # by how much it is ahead at `began_ns`
-    drift_ppb: int = 0  # parts per billion by which it runs fast
-    began_ns: int = field(default_factory=time.monotonic_ns)
-
-    def local_ns(self, monotonic_ns: int) -> int:
-        """What the clock shows at a time of CLOCK_MONOTONIC."""
-        return monotonic_ns + self.offset_ns + (monotonic_ns - self.began_ns) * self.drift_ppb // _SECOND
-
-    def monotonic_ns(self, local_ns: int) -> int:
-        """The first ns of CLOCK_MONOTONIC at which the clock shows a time, or is past it."""
-        elapsed = local_ns - self.offset_ns - self.began_ns
-        return self.began_ns + elapsed - elapsed * self.drift_ppb // (_SECOND + self.drift_ppb)
 
 
 class Delays:
