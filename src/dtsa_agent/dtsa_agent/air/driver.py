@@ -92,7 +92,7 @@ class LiveAgent:
         senses = type(vehicle).sense is not AgentVehicle.sense
         sense = (lambda slot: vehicle.sense(self.swarm)) if senses else None
         now = self.clock.local_ns(time.monotonic_ns())
-        self._records = None if self.watcher is None else SlotRecords(self.watcher)
+        self._records = SlotRecords(self.watcher)
         return Station(self.swarm, self._settings, now, sense, self, every_frame)
 
     # The loop.
@@ -140,8 +140,7 @@ class LiveAgent:
                 select.select(descriptor, (), (), left)
             else:  # one wake-up a slot: datagrams wait in the port, which has noted when they arrived
                 time.sleep(left)
-        if self._records is not None:
-            self._records.close()
+        self._records.close()
 
     def _has_ended(self, stop: Stop) -> bool:
         """Whether to end now: after a second signal, when it has announced that it leaves, or has no time left to."""
@@ -169,23 +168,22 @@ class LiveAgent:
             self.reports.unsent(refusal, now)
             return
         self.reports.sent(max(0, shown - self.station.slot_start_ns(self.station.slot)), now)
-        if self._records is not None:
-            self._records.sent(shown, datagram)
+        self._records.sent(shown, datagram)
 
     # Events of the station.
 
     def opened(self, slot: int, start_ns: int, is_first: bool) -> None:
-        if self._records is not None:
-            swarm = self.swarm
-            self._records.open(SlotRecord(
-                slot, start_ns, is_first, int(swarm.present[0]), int(swarm.chosen[0]), int(swarm.reason[0]),
-                int(swarm.digest[0]), float(swarm.score[0]), swarm.track[:, :, 0].copy(), swarm.velocity[:, 0].copy(),
-                swarm.command[:, 0].copy(), swarm.goal[:, 0].copy(),
-            ))  # fmt: skip
+        if self.watcher is None:
+            return
+        swarm = self.swarm
+        self._records.open(SlotRecord(
+            slot, start_ns, is_first, int(swarm.present[0]), int(swarm.chosen[0]), int(swarm.reason[0]),
+            int(swarm.digest[0]), float(swarm.score[0]), swarm.track[:, :, 0].copy(), swarm.velocity[:, 0].copy(),
+            swarm.command[:, 0].copy(), swarm.goal[:, 0].copy(),
+        ))  # fmt: skip
 
     def restarted(self, slot: int) -> None:
-        if self._records is not None:
-            self._records.restart()
+        self._records.restart()
         self.slot = slot
         self.reports.joined()
 
@@ -193,8 +191,7 @@ class LiveAgent:
         if accepted and self._header is not None:
             start, late = self.station.slot_start_ns(slot), self._header.late_ns(datagram)
             self.reports.arrived(arrival_ns - start - self._flight_ns - late)
-        if self._records is not None:
-            self._records.heard(ReceivedFrame(sender, slot, arrival_ns, datagram, accepted))
+        self._records.heard(ReceivedFrame(sender, slot, arrival_ns, datagram, accepted))
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
         self.reports.refused(fault, time.monotonic_ns())

@@ -70,9 +70,9 @@ class Watcher(Protocol):
 
 
 class SlotRecords:
-    """Puts together what happens in the slots of one agent, and hands each to a watcher when it is over."""
+    """Puts together what happens in the slots of one agent, and hands each to a watcher, if any, when it is over."""
 
-    def __init__(self, watcher: Watcher) -> None:
+    def __init__(self, watcher: Watcher | None) -> None:
         self._watcher = watcher
         self._record: SlotRecord | None = None  # of the present slot
         self._before: list[ReceivedFrame] = []  # since the agent restarted, before its first slot
@@ -94,12 +94,13 @@ class SlotRecords:
 
     def heard(self, frame: ReceivedFrame) -> None:
         """The agent has heard a frame."""
-        (self._before if self._record is None else self._record.heard).append(frame)
+        if self._watcher is not None:
+            (self._before if self._record is None else self._record.heard).append(frame)
 
     def close(self) -> None:
         """The present slot is over."""
         record, self._record = self._record, None
-        if record is not None:
+        if record is not None and self._watcher is not None:
             self._watcher.slot(record)
 
 
