@@ -75,7 +75,7 @@ def test_packets_are_found_in_whole_and_in_split_transfers(packets: list[tuple[b
         data = heard(payload, stamp, rssi)
         for part in [data[:64], data[64:]] if split and len(data) > 64 else [data]:
             found += reader.feed(part)
-    assert [(p.payload, p.stamp_us, -p.rssi_dbm) for p in found] == packets
+    assert [(p.payload, p.stamp_us) for p in found] == [packet[:2] for packet in packets]
     assert reader.garbled == 0
 
 
