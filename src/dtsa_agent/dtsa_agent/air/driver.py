@@ -165,10 +165,10 @@ class LiveAgent:
         now = time.monotonic_ns()
         self.station.sent(self.clock.local_ns(now), not refusal)
         if refusal:
-            self.reports.unsent(refusal, now)
+            self.reports.count_unsent(refusal, now)
             return
-        self.reports.sent(max(0, shown - self.station.slot_start_ns(self.station.slot)), now)
-        self._records.sent(shown, datagram)
+        self.reports.count_transmission(max(0, shown - self.station.slot_start_ns(self.station.slot)), now)
+        self._records.transmit(shown, datagram)
 
     # Events of the station.
 
@@ -185,16 +185,16 @@ class LiveAgent:
     def restarted(self, slot: int) -> None:
         self._records.restart()
         self.slot = slot
-        self.reports.joined()
+        self.reports.join()
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         if accepted and self._header is not None:
             start, late = self.station.slot_start_ns(slot), self._header.late_ns(datagram)
-            self.reports.arrived(arrival_ns - start - self._flight_ns - late)
-        self._records.heard(ReceivedFrame(sender, slot, arrival_ns, datagram, accepted))
+            self.reports.count_arrival(arrival_ns - start - self._flight_ns - late)
+        self._records.receive(ReceivedFrame(sender, slot, arrival_ns, datagram, accepted))
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
-        self.reports.refused(fault, time.monotonic_ns())
+        self.reports.count_refused(fault, time.monotonic_ns())
         if self.watcher is not None:
             self.watcher.refused(fault, datagram, arrival_ns)
 

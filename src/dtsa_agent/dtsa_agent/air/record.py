@@ -87,12 +87,12 @@ class SlotRecords:
         self.close()
         self._before.clear()
 
-    def sent(self, at_ns: int, datagram: bytes) -> None:
+    def transmit(self, at_ns: int, datagram: bytes) -> None:
         """The agent has sent a datagram at a time of its own clock."""
         if self._record is not None:
             self._record.sent_ns, self._record.datagram = at_ns, datagram
 
-    def heard(self, frame: ReceivedFrame) -> None:
+    def receive(self, frame: ReceivedFrame) -> None:
         """The agent has heard a frame."""
         if self._watcher is not None:
             (self._before if self._record is None else self._record.heard).append(frame)
@@ -135,7 +135,7 @@ class AgentReports:
         self._timed = (-1, 0)  # frames of about the own time so far, of these off their slots
         self._slots_too_short = False
 
-    def joined(self) -> None:
+    def join(self) -> None:
         """It has slots, perhaps other ones than before."""
         self._joined_s = self._joined_s or _processor_s()
 
@@ -199,17 +199,17 @@ class AgentReports:
                 " were off by more than a quarter of a slot"
             )
 
-    def refused(self, fault: str, now_ns: int) -> None:
+    def count_refused(self, fault: str, now_ns: int) -> None:
         """A datagram was not accepted: one of other settings or another key is worth a line."""
         self.not_taken_in[fault] += 1
         if fault in _FOREIGN:
             self._foreign_due_ns = self._foreign_due_ns or max(now_ns + _SECOND, self._foreign_next_ns)
 
-    def arrived(self, off_ns: int) -> None:
+    def count_arrival(self, off_ns: int) -> None:
         """A frame has arrived so much earlier or later than expected, over a port whose arrivals vary."""
         self._off.add(abs(off_ns))
 
-    def sent(self, late_ns: int, now_ns: int) -> None:
+    def count_transmission(self, late_ns: int, now_ns: int) -> None:
         """A frame has left so much later than its slot began."""
         self._late.add(late_ns)
         self._on_time += late_ns <= _ON_TIME_NS
@@ -219,7 +219,7 @@ class AgentReports:
                 self._log(f"frames leave again; for {lasted_s:.1f} s none did, {self._outage_count} were refused")
             self._outage_ns, self._outage_count, self._outage_printed = 0, 0, False
 
-    def unsent(self, refusal: str, now_ns: int) -> None:
+    def count_unsent(self, refusal: str, now_ns: int) -> None:
         """The port has refused a frame; a queue that is full for a moment is worth no line."""
         self._unsent[refusal] += 1
         self._outage_ns = self._outage_ns or now_ns

@@ -150,7 +150,7 @@ def test_the_counts_knows_how_late_frames_left() -> None:
     counts = AgentReports(1, 10.0, None, 0)
     assert counts.summary(STATUS, (0, 0))["sends_on_time_share"] is None
     for late in (0, 50_000, 60_000, 3_000_000):
-        counts.sent(late, 0)
+        counts.count_transmission(late, 0)
     found = counts.summary(SimpleNamespace(**vars(STATUS) | {"sent": 4}), (0, 0))
     assert found["sends_on_time_share"] == 0.75
     assert found["send_late_ms"] == {"p50": pytest.approx(0.05, rel=0.05), "p99": 3.0, "max": 3.0}
@@ -208,7 +208,7 @@ def test_other_settings_and_another_key_are_said_in_flight() -> None:
 
     def arrives(*data: bytes) -> list[str]:
         for one in data:
-            reports.refused(here.read(one).fault, now[0])
+            reports.count_refused(here.read(one).fault, now[0])
         reports.status(flies(2), now[0])
         return [line for line in lines if "datagrams" in line]
 

@@ -55,11 +55,11 @@ class _AgentFlight:
             return
         kind, accepted, sender, length, slot, at_ns, frame = _HEARD.unpack(data)
         if kind == ord("S"):
-            self._records.sent(at_ns, frame[:length])
+            self._records.transmit(at_ns, frame[:length])
         elif kind == ord("A"):
             self._records.restart()
         else:
-            self._records.heard(ReceivedFrame(sender, slot, at_ns, frame[:length], bool(accepted)))
+            self._records.receive(ReceivedFrame(sender, slot, at_ns, frame[:length], bool(accepted)))
 
     def _open(self, data: bytes) -> None:
         _, is_first, reason, _, slot, start, _, present, chosen, digest, score, *vectors, _ = _OPENED.unpack(data)
