@@ -11,16 +11,13 @@ import shutil
 import sys
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.port import PortSettings, open_port
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.stop import Stop
-
-if TYPE_CHECKING:
-    from dtsa_bench.log.agent_bag import AgentRecorder
 
 
 def check(own: AgentSettings, config: SwarmConfig, port: PortSettings, seconds: float, as_json: bool) -> int:
@@ -58,7 +55,12 @@ def fly(own: AgentSettings, config: SwarmConfig, port: PortSettings, out: str | 
     terminal = _Terminal(own.id)
     with Stop() as stop, open_port(port) as opened:
         agent = LiveAgent(own, config, opened, log=terminal.log, show=terminal.show if sys.stderr.isatty() else None)
-        with nullcontext() if out is None else _recorded(out, agent, port) as recorder:
+        record: AbstractContextManager[Any] = nullcontext()
+        if out is not None:
+            from dtsa_bench.log.agent_bag import recorded
+
+            record = recorded(out, agent, port)
+        with record as recorder:
             agent.run(stop)
         summary = agent.summary() if recorder is None else recorder.summary
     from dtsa_bench.runs.delivery import counts_of_datagrams
@@ -76,12 +78,6 @@ def fly(own: AgentSettings, config: SwarmConfig, port: PortSettings, out: str | 
 
         raise BagError(recorder.failure)
     return int(bool(problem))
-
-
-def _recorded(out: str, agent: LiveAgent, port: PortSettings) -> AbstractContextManager[AgentRecorder]:
-    from dtsa_bench.log.agent_bag import recorded
-
-    return recorded(out, agent, port)
 
 
 def brief(summary: Mapping[str, Any]) -> str:
