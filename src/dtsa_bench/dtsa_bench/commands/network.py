@@ -19,7 +19,7 @@ from dtsa_agent.core.settings.declaration import Setting, Settings, names_with_v
 from dtsa_agent.core.station import check_joinable
 from dtsa_agent.keys import check_key, check_session
 from dtsa_agent.yaml_file import read_yaml
-from dtsa_bench.runs.options import add_options, given_options, new_directory, number
+from dtsa_bench.runs.options import add_options, new_directory, number, option_values
 
 from .registry import Command, add_rows, warn
 
@@ -67,7 +67,7 @@ def read_network_options(args: argparse.Namespace) -> tuple[PortSettings, SwarmC
         for name, value in values.items() if value is not None
     })  # fmt: skip
     named = {"policy": args.policy or DEFAULT_POLICY, "auth": args.seal is not False}
-    config = SwarmConfig.from_dict({**given_options(args, SwarmConfig, "swarm"), **named})
+    config = SwarmConfig.from_dict({**option_values(args, SwarmConfig, "swarm"), **named})
     check_key(config)  # before anything is made
     check_session(config)
     return port, config
@@ -77,7 +77,7 @@ def _read_file(args: argparse.Namespace) -> None:
     """Settings of the file stand for options that were not given; an error names both."""
     path = args.swarm_file
     values = {} if path is None else _content(path)
-    carriers = Setting("air", "text", None, "what carries the frames", words=AIRS)
+    carriers = Setting("air", "text", None, "what carries the frames", choices=AIRS)
     air = values.pop("air", AIRS[0])
     args.air = args.air or carriers.check(air, f"air in {path}")
     sections: dict[str, type[Settings]] = {"swarm": SwarmConfig, "port": settings_class(args.air), "own": AgentSettings}
@@ -134,7 +134,7 @@ environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
         from dtsa_bench.network.flying import check, fly
 
         port, config = read_network_options(args)
-        own = AgentSettings.from_dict(given_options(args, AgentSettings, "own"))
+        own = AgentSettings.from_dict(option_values(args, AgentSettings, "own"))
         check_joinable(config.policy)  # before anything is made
         check_fits(config, port.properties)
         if args.check is not None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm
 from dtsa_agent.core.kernel import ffi, lib, memory
-from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
@@ -54,7 +54,7 @@ def may_share(run: RunConfig) -> bool:
     """
     air, longest_ns = run.air, run.air.airtime.total_ns(run.air.airtime.longest)
     is_lossless = not any(getattr(air, name) for name in _LOSSES) and longest_ns <= air.slot_ns
-    return is_lossless and can_share_table(run.swarm)
+    return is_lossless and run.swarm.may_share_table
 
 
 class FlightMetrics:
@@ -80,7 +80,7 @@ class FlightMetrics:
         self.woken = np.full(agents, -1, dtype=np.int64)  # (N,) slot in which each that flies got its goal; -1: stands
         self._heard = np.zeros(agents, dtype=np.uint8)  # whether any agent has heard it since
         self._delays = np.zeros(_DELAYS, dtype=np.int64)
-        self._course = scenario.course(np.arange(agents, dtype=np.int32))
+        self._course = scenario.course(np.arange(agents, dtype=np.int32), swarm.r_min)
         target = np.array(scenario.target, dtype=np.float64)
         arrays = {
             "path": self._path, "last_position": self._last, "target": target, "goal": target.copy(),
@@ -108,11 +108,6 @@ class FlightMetrics:
     def slots(self) -> int:
         """Slots flown."""
         return int(self.kernel.slots)
-
-    @property
-    def completion_slot(self) -> int:
-        """Slots flown when all had arrived at the same time, -1: not yet."""
-        return int(self.kernel.completion_slot)
 
     @property
     def crash_slot(self) -> int:
@@ -212,9 +207,9 @@ class FlightMetrics:
         """
         path, plan = self._path, self.scenario.plan
         if plan is not None and len(plan.goals) > 1:
-            if self.completion_slot < 0:
+            if self.kernel.completion_slot < 0:  # not all have arrived at the same time
                 return {}
-            direct = plan.path_length
+            direct = self.scenario.path_length
         else:
             direct = np.sqrt(((self._last - self.scenario.start) ** 2).sum(axis=0))
         return {int(k) + 1: float(direct[k] / path[k]) for k in np.flatnonzero(self._moving) if path[k] > 0.0}
@@ -224,7 +219,7 @@ class FlightMetrics:
 
         A figure that does not exist (no movers, not complete, ...) is None.
         """
-        swarm, sums = self.run.swarm, self.kernel
+        swarm, sums, complete = self.run.swarm, self.kernel, self.kernel.completion_slot >= 0
         flown = self.slots * swarm.slot_ns / 1e9
         pair = [sums.pair_1, sums.pair_2] if sums.pair_1 else None
         news = sums.age_count
@@ -235,7 +230,7 @@ class FlightMetrics:
         return {
             "agents": swarm.agents, "moving": swarm.movers, "policy": swarm.policy, "estimator": swarm.estimator,
             "avoider": swarm.avoider, "slot_ms": swarm.slot_ms, "loss": self.run.air.loss, "seed": swarm.seed,
-            "end": self.end or STOPPED, "completed": self.completion_slot >= 0, "timed_out": self.end == TIMED_OUT,
+            "end": self.end or STOPPED, "completed": complete, "timed_out": self.end == TIMED_OUT,
             "collided": self.crash_slot >= 0,
             "collided_pair": list(self.collided_pair) if self.collided_pair else None,
             "slots": {"total": self.slots, **{name: sums.outcomes[code] for name, code in outcomes.items()}},
@@ -243,7 +238,7 @@ class FlightMetrics:
             "min_distance_pair": pair,
             "min_distance_time_s": sums.min_slot * swarm.slot_ns / 1e9 if pair else None,
             "efficiency_mean": sum(efficiency) / len(efficiency) if efficiency else None,
-            "completion_time_s": self.completion_slot * swarm.slot_ns / 1e9 if self.completion_slot >= 0 else None,
+            "completion_time_s": sums.completion_slot * swarm.slot_ns / 1e9 if complete else None,
             "flight_time_s": flown,
             "first_divergence_slot": sums.split_slot if sums.split_slot >= 0 else None,
             "equal_tables_share": 1.0 - sums.split / sums.compared if sums.compared else 1.0,
