@@ -27,7 +27,7 @@ FIRST_FIRMWARE = 0x0504  # of a Crazyradio 2.0 that has sniffer mode
 USB_PACKET = 64  # bytes: a transfer ends with a shorter one
 BROADCAST = bytes.fromhex("FFE7E7E7E7")  # to which Crazyflies send to each other
 _LONGEST_PAYLOAD = 63
-_HEAD = struct.Struct("<BBBI")  # length of all, RSSI, pipe, stamp
+_HEAD = struct.Struct("<BxxI")  # length of all; RSSI and pipe; stamp
 _PEER, _PEER_BITS, _PORT = 0xFF, 0xF3, 0x80
 _VENDOR, _PRODUCT = 0x1915, 0x7777
 _OUT, _IN = 0x01, 0x81
@@ -54,8 +54,6 @@ class RadioPacket(NamedTuple):
     """A packet that the dongle has heard."""
 
     payload: bytes
-    rssi_dbm: int
-    pipe: int  # 0 or 1: to which of its two addresses
     stamp_us: int  # of the dongle's clock when it was whole, 32 bits
 
 
@@ -87,8 +85,8 @@ class PacketReader:
                     self._rest = data[at:]
                     return packets
                 break
-            _, rssi, pipe, stamp = _HEAD.unpack_from(data, at)
-            packets.append(RadioPacket(data[at + _HEAD.size : end], -rssi, pipe, stamp))
+            _, stamp = _HEAD.unpack_from(data, at)
+            packets.append(RadioPacket(data[at + _HEAD.size : end], stamp))
             at = end
         self.garbled += at < len(data)
         return packets
@@ -248,7 +246,7 @@ class CrazyradioPort(DevicePort):
                 if datagram is None:
                     self._others += 1
                 else:
-                    self._queue(datagram, arrival_ns, False)
+                    self._queue(datagram, arrival_ns)
             if now >= counts_due_ns:
                 counts_due_ns = now + _COUNTS_NS
                 dropped = bytes(device.ctrl_transfer(VENDOR_IN, GET_SNIFFER_DROP_COUNT, 0, 0, 4, _REQUEST_MS))

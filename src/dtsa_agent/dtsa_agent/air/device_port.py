@@ -79,12 +79,12 @@ class DevicePort(Port):
             os.eventfd_write(self._event, 1)
         return datagrams
 
-    def _queue(self, data: bytes, arrival_ns: int, own: bool) -> None:
+    def _queue(self, data: bytes, arrival_ns: int) -> None:
         """Keep a datagram that the thread has read for the agent."""
         if len(self._arrived) >= _ROOM:
             self.overflowed += 1
             return
-        self._arrived.append(ReceivedDatagram(data, arrival_ns, own))
+        self._arrived.append(ReceivedDatagram(data, arrival_ns))
         os.eventfd_write(self._event, 1)
 
     def _run(self) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import select
 import time
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -18,20 +17,19 @@ import numpy as np
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.station import HoverReason, Station, StationSettings, check_joinable
+from dtsa_agent.core.station import ClockMap, Station, StationSettings, check_joinable
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.priority import realtime_thread, wake_precisely
 from dtsa_agent.stop import Stop
 
-from .port import ClockMap, Port, check_fits, link_of
-from .record import AgentCounts, ReceivedFrame, Reports, SlotRecord, Watcher
+from .port import Port, check_fits, link_of
+from .record import AgentReports, ReceivedFrame, SlotRecord, SlotRecords, Watcher
 from .settings import AgentSettings
 
 _SECOND, _NEVER = 1_000_000_000, 1 << 62  # ns
 _SIGNAL_POLL_S = 0.05  # a signal is noticed after this time at the latest
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
-_STATUS_NS = 100_000_000  # from one check of the station's status to the next
 _BURST = 16  # datagrams that are read at a time: whatever comes, the own slots go on
 
 
@@ -77,18 +75,14 @@ class LiveAgent:
         self.own, self.config, self.port, self.watcher = own, config, port, watcher
         self._settings = StationSettings(config, link, authenticator(config), own.id, own.quorum)
         self.swarm = make_swarm(config, local=[own.id])
-        self.clock = ClockMap(own.clock_offset_ns, own.clock_drift_ppb)
+        self.clock = ClockMap(own.clock_offset_ns, own.clock_drift_ppb, time.monotonic_ns())
         self._header = port.properties.header(config.auth) if port.properties.varies else None
         self._vehicle = vehicle or AgentVehicle()
         self.station = self._start()
         self.slot = -1  # the present slot
-        self.counts = AgentCounts()
         port.log = log
-        self._reports = Reports(own.id, config.slot_ms, log, time.monotonic_ns(), show)
-        self._status_due_ns = 0
+        self.reports = AgentReports(own.id, config.slot_ms, log, time.monotonic_ns(), show)
         self._flight_ns = link.flight_ns
-        self._record: SlotRecord | None = None  # of the present slot
-        self._before: list[ReceivedFrame] = []  # since it restarted, before its first slot
         self._no_priority = ""  # why it has none
         self._leaves_by: int | None = None  # CLOCK_MONOTONIC, ns
         self._signals = 0
@@ -98,6 +92,7 @@ class LiveAgent:
         senses = type(vehicle).sense is not AgentVehicle.sense
         sense = (lambda slot: vehicle.sense(self.swarm)) if senses else None
         now = self.clock.local_ns(time.monotonic_ns())
+        self._records = SlotRecords(self.watcher)
         return Station(self.swarm, self._settings, now, sense, self, every_frame)
 
     # The loop.
@@ -109,14 +104,14 @@ class LiveAgent:
         gc.freeze()  # nothing made so far is garbage: do not look at it again and again
         with realtime_thread(self.own.priority) as self._no_priority:
             self._run(stop)
-        self.counts.ended_ns = time.monotonic_ns()
+        self.reports.ended_ns = time.monotonic_ns()
 
     def _run(self, stop: Stop) -> None:
-        began = self.counts.began_ns = time.monotonic_ns()
+        began = self.reports.began_ns = time.monotonic_ns()
         end = began + round(self.own.duration_s * _SECOND) if self.own.duration_s else _NEVER
         while not self._vehicle.is_ready():
             now = time.monotonic_ns()
-            self._reports.state("waits for the vehicle's odometry", now)
+            self.reports.state("waits for the vehicle's odometry", now)
             if stop or now >= end:
                 return
             time.sleep(_SIGNAL_POLL_S)
@@ -137,7 +132,7 @@ class LiveAgent:
             if count == _BURST:
                 continue
             if self.slot < 0:
-                self._reports.state("listens for others", now)
+                self.reports.state("listens for others", now)
             left = min((clock.monotonic_ns(due) - time.monotonic_ns()) / 1e9, _SIGNAL_POLL_S)
             if left <= 0:
                 continue
@@ -145,7 +140,7 @@ class LiveAgent:
                 select.select(descriptor, (), (), left)
             else:  # one wake-up a slot: datagrams wait in the port, which has noted when they arrived
                 time.sleep(left)
-        self._close_record()
+        self._records.close()
 
     def _has_ended(self, stop: Stop) -> bool:
         """Whether to end now: after a second signal, when it has announced that it leaves, or has no time left to."""
@@ -160,75 +155,53 @@ class LiveAgent:
 
     def _fly(self, slot: int, now: int) -> None:
         """A slot has begun: fly through it."""
-        counts, hovers = self.counts, self.station.hovers
         self.slot = slot
         self._vehicle.fly(self.swarm, slot)
-        if hovers == HoverReason.NONE:
-            counts.flew = True
-        elif hovers == HoverReason.NO_QUORUM:
-            counts.hovered[counts.flew] += 1
-        if now >= self._status_due_ns:
-            self._status_due_ns = now + _STATUS_NS
-            status = self.station.status
-            if hovers != HoverReason.IS_NEW:
-                counts.add_contacts(status.others, status.hears)
-            self._reports.status(status, now)
+        self.reports.slot(self.station, now)
 
     def _send(self, datagram: bytes, shown: int) -> None:
         """Hand a datagram to the port; shown: what the own clock showed when it was due."""
         refusal = self.port.send(datagram)
         now = time.monotonic_ns()
         self.station.sent(self.clock.local_ns(now), not refusal)
-        self._reports.sent(refusal, now)
         if refusal:
-            self.counts.unsent[refusal] += 1
+            self.reports.count_unsent(refusal, now)
             return
-        self.counts.add_sent(max(0, shown - self.station.slot_start_ns(self.station.slot)))
-        if self._record is not None:
-            self._record.sent_ns, self._record.datagram = shown, datagram
+        self.reports.count_transmission(max(0, shown - self.station.slot_start_ns(self.station.slot)), now)
+        self._records.transmit(shown, datagram)
 
     # Events of the station.
 
-    def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
-        self._close_record()
+    def opened(self, slot: int, start_ns: int, is_first: bool) -> None:
         if self.watcher is None:
             return
-        swarm, before, self._before = self.swarm, self._before, []
-        self._record = SlotRecord(
-            slot, start_ns, now_ns, is_first, int(swarm.present[0]), int(swarm.chosen[0]), int(swarm.reason[0]),
+        swarm = self.swarm
+        self._records.open(SlotRecord(
+            slot, start_ns, is_first, int(swarm.present[0]), int(swarm.chosen[0]), int(swarm.reason[0]),
             int(swarm.digest[0]), float(swarm.score[0]), swarm.track[:, :, 0].copy(), swarm.velocity[:, 0].copy(),
-            swarm.command[:, 0].copy(), swarm.goal[:, 0].copy(), swarm.frame(0), before=before,
-        )  # fmt: skip
+            swarm.command[:, 0].copy(), swarm.goal[:, 0].copy(),
+        ))  # fmt: skip
 
     def restarted(self, slot: int) -> None:
-        self._close_record()
-        self._before.clear()
+        self._records.restart()
         self.slot = slot
-        self.counts.add_start(slot + 1)
+        self.reports.join()
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         if accepted and self._header is not None:
             start, late = self.station.slot_start_ns(slot), self._header.late_ns(datagram)
-            self.counts.add_arrival(arrival_ns - start - self._flight_ns - late)
-        if self.watcher is not None:
-            frame = ReceivedFrame(sender, slot, arrival_ns, datagram, accepted)
-            (self._before if self._record is None else self._record.heard).append(frame)
+            self.reports.count_arrival(arrival_ns - start - self._flight_ns - late)
+        self._records.receive(ReceivedFrame(sender, slot, arrival_ns, datagram, accepted))
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
-        self.counts.refused[fault] += 1
-        self._reports.foreign(fault, time.monotonic_ns())
+        self.reports.count_refused(fault, time.monotonic_ns())
         if self.watcher is not None:
             self.watcher.refused(fault, datagram, arrival_ns)
 
-    def _close_record(self) -> None:
-        record, self._record = self._record, None
-        if record is not None and self.watcher is not None:
-            self.watcher.slot(record)
-
     def summary(self) -> dict[str, Any]:
         """Return the results of the flight, as plain values."""
-        swarm, away = self.swarm, self.swarm.goal[:, 0] - self.swarm.position[:, 0]
-        refused = self.counts.refused + Counter({"malformed": swarm.malformed, "foreign": swarm.foreign})
+        swarm, station = self.swarm, self.station
+        away = swarm.goal[:, 0] - swarm.position[:, 0]
         return {
             "id": self.own.id,
             "agents": self.config.agents,
@@ -237,10 +210,10 @@ class LiveAgent:
             "sealed": self.config.auth,
             "no_priority": self._no_priority,
             "quorum": self.own.quorum,
-            **self.counts.summary(self.station.status, self.station.longest_gap()),
-            "slots_too_short": self._reports.slots_too_short,
+            **self.reports.summary(
+                station.status, station.longest_gap(), malformed=swarm.malformed, foreign=swarm.foreign
+            ),
             "heard_of": sorted(int(k) + 1 for k in np.flatnonzero(swarm.sent_slot[0] >= 0) if k + 1 != self.own.id),
-            "not_taken_in": dict(sorted(refused.items())),
             **self.port.counts(),
             "position_m": [round(float(x), 4) for x in swarm.position[:, 0]],
             "arrived": bool(np.sqrt((away * away).sum()) <= self.config.r_min and swarm.final[0]),

@@ -18,10 +18,9 @@ the frame is. Times are integer ns, CLOCK_MONOTONIC unless said otherwise.
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -29,30 +28,11 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
-from dtsa_agent.core.station import BETWEEN, Link, Station
+from dtsa_agent.core.station import BETWEEN, ClockMap, Link, Station
 
-_SECOND = 1_000_000_000
 _MAGIC = b"DT\x01\x00"
 _WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic
 _TRUST_NS = 1_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class ClockMap:
-    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift."""
-
-    offset_ns: int = 0  # by how much it is ahead at `began_ns`
-    drift_ppb: int = 0  # parts per billion by which it runs fast
-    began_ns: int = field(default_factory=time.monotonic_ns)
-
-    def local_ns(self, monotonic_ns: int) -> int:
-        """What the clock shows at a time of CLOCK_MONOTONIC."""
-        return monotonic_ns + self.offset_ns + (monotonic_ns - self.began_ns) * self.drift_ppb // _SECOND
-
-    def monotonic_ns(self, local_ns: int) -> int:
-        """The first ns of CLOCK_MONOTONIC at which the clock shows a time, or is past it."""
-        elapsed = local_ns - self.offset_ns - self.began_ns
-        return self.began_ns + elapsed - elapsed * self.drift_ppb // (_SECOND + self.drift_ppb)
 
 
 class Header(NamedTuple):
@@ -94,21 +74,17 @@ class PortProperties:
 
 
 class ReceivedDatagram(NamedTuple):
-    """A datagram that has arrived."""
+    """A datagram of another port that has arrived."""
 
     data: bytes
     arrival_ns: int
-    own: bool  # this very port has sent it
 
 
 P = TypeVar("P", bound="Port")
 
 
 class Port(ABC):
-    """What carries the datagrams of an agent with a clock of its own, or brings them to a listener. A context manager.
-
-    What it sends may come back to it, marked as its own.
-    """
+    """Carries the datagrams of an agent with a clock of its own, or brings them to a listener. A context manager."""
 
     properties: PortProperties
     log: Callable[[str], None] | None = None  # prints a line when the port fails or is back; its user sets it
@@ -128,7 +104,7 @@ class Port(ABC):
 
     @abstractmethod
     def receive(self, most: int) -> list[ReceivedDatagram]:
-        """Return what has arrived, in this order; empty if nothing has.
+        """Return what others have sent, in the order of arrival; empty if nothing has come.
 
         :param most: datagrams that are returned at most.
         :returns: each with its time of arrival, ns, CLOCK_MONOTONIC.
@@ -151,8 +127,7 @@ class Port(ABC):
         """
         datagrams = self.receive(most)
         for datagram in datagrams:
-            if not datagram.own:
-                station.receive(datagram.data, clock.local_ns(datagram.arrival_ns))
+            station.receive(datagram.data, clock.local_ns(datagram.arrival_ns))
         return len(datagrams)
 
     def print(self, text: str) -> None:

@@ -169,13 +169,12 @@ class SerialPort(DevicePort):
     def _receive(self, chunk: bytes, now_ns: int) -> None:
         self._mavlink += sum(chunk.count(first) for first in _MAVLINK)
         for datagram, after in self._reader.feed(chunk):
-            own = datagram in self._sent
-            self._echoes += own
             self._datagrams += 1
-            # The bytes after it in the same chunk have taken their time on the line.
-            self._queue(datagram, now_ns - after * self._settings.line_byte_ns, own)
-            if own:
+            if datagram in self._sent:
+                self._echoes += 1
                 self._print_once("gives back what it is given: own frames are left out")
+            else:  # the bytes after it in the same chunk have taken their time on the line
+                self._queue(datagram, now_ns - after * self._settings.line_byte_ns)
         before, garbled = self._clean
         if self._datagrams != before:
             self._clean, self._mavlink = (self._datagrams, self._reader.garbled_bytes), 0

@@ -107,7 +107,7 @@ int socket_read(socket_reader *r, int most)
     return count;
 }
 
-/* As ClockMap.local_ns (air/port.py): rounded down. */
+/* As ClockMap.local_ns (core/station.py): rounded down. */
 static int64_t local_ns(int64_t monotonic_ns, int64_t offset_ns, int64_t drift_ppb,
                         int64_t began_ns)
 {

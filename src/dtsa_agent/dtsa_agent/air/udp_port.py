@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.station import Station
+from dtsa_agent.core.station import ClockMap, Station
 
-from .port import ClockMap, Port, ReceivedDatagram
+from .port import Port, ReceivedDatagram
 from .settings import UdpSettings
 
 _SIOCGIFADDR = 0x8915
@@ -33,9 +33,8 @@ class InterfaceState(NamedTuple):
 class UdpPort(Port):
     """Sends to a group and hears what others send to it.
 
-    Datagrams of other groups and interfaces do not get in. What it sends comes back to it, marked as its own: other
-    agents on this computer hear it in the same way. When the interface is made anew, or gets another address, the group
-    is joined again: at a send that the network refuses, and for those that only listen within a second.
+    Datagrams of other groups and interfaces do not get in. When the interface is made anew, or gets another address,
+    the group is joined again: at a send that the network refuses, and for those that only listen within a second.
 
     :raises ConfigError: if the interface cannot be used.
     """
@@ -123,7 +122,7 @@ class UdpPort(Port):
     def receive(self, most: int) -> list[ReceivedDatagram]:
         self._check_in_time()
         datagrams = (self._reader.datagrams[k] for k in range(lib.socket_read(self._reader, most)))
-        return [ReceivedDatagram(bytes(ffi.buffer(d.data, d.length)), d.arrival_ns, bool(d.own)) for d in datagrams]
+        return [ReceivedDatagram(bytes(ffi.buffer(d.data, d.length)), d.arrival_ns) for d in datagrams if not d.own]
 
     def deliver(self, station: Station, clock: ClockMap, most: int) -> int:
         self._check_in_time()

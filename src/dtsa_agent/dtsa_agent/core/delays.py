@@ -47,3 +47,8 @@ class Delays:
         if not self.count(series):
             return None
         return float(self._largest[slice(None) if series is None else series].max()) / 1e6
+
+    def quantiles_ms(self, series: int | None = None) -> dict[str, float | None]:
+        """Median, 99 % quantile and largest delay, ms, for summaries; None without any."""
+        middle, high = (self.quantile_ms(share, series) for share in (0.5, 0.99))
+        return {"p50": middle, "p99": high, "max": self.largest_ms(series)}

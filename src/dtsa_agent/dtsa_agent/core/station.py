@@ -29,8 +29,27 @@ _, _, LENGTH, OTHER_SETTINGS, NO_FRAME, _, REJECTED, REPEATED, OTHER_TIME, _, TO
 STATES = ("listening", "alone", "joined")
 ALL_BUT_ONE = "all-but-one"
 QUORUMS = f"{ALL_BUT_ONE}, a share of the others (80%), or a number of them (0: it never hovers for this)"
+_SECOND = 1_000_000_000
 BETWEEN = lib.DTSA_BETWEEN / 1000  # of a slot, between a frame that left late and the next slot
 EARLY_COUNT = 64  # frames of slots still to come that are kept
+
+
+@dataclass(frozen=True, slots=True)
+class ClockMap:
+    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift."""
+
+    offset_ns: int = 0  # by how much it is ahead at `began_ns`
+    drift_ppb: int = 0  # parts per billion by which it runs fast
+    began_ns: int = 0  # CLOCK_MONOTONIC
+
+    def local_ns(self, monotonic_ns: int) -> int:
+        """What the clock shows at a time of CLOCK_MONOTONIC."""
+        return monotonic_ns + self.offset_ns + (monotonic_ns - self.began_ns) * self.drift_ppb // _SECOND
+
+    def monotonic_ns(self, local_ns: int) -> int:
+        """The first ns of CLOCK_MONOTONIC at which the clock shows a time, or is past it."""
+        elapsed = local_ns - self.offset_ns - self.began_ns
+        return self.began_ns + elapsed - elapsed * self.drift_ppb // (_SECOND + self.drift_ppb)
 
 
 class HoverReason(IntEnum):
@@ -83,7 +102,7 @@ class ParsedDatagram(NamedTuple):
 class Events(Protocol):
     """Recorder of what happens to a station."""
 
-    def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
+    def opened(self, slot: int, start_ns: int, is_first: bool) -> None:
         """A slot is open: the agent has decided."""
 
     def restarted(self, slot: int) -> None:
@@ -357,7 +376,7 @@ _callback(lambda s, slot: s.swarm.end(slot), "station_close")
 _callback(lambda s: s.swarm.restart(0), "station_restart")
 _callback(Station.leave_air, "station_leave")
 _callback(Station.probation, "station_on_probation")
-_callback(lambda s, slot, start, now, first: s.events.opened(slot, start, now, bool(first)), "station_opened")
+_callback(lambda s, slot, start, _, first: s.events.opened(slot, start, bool(first)), "station_opened")
 _callback(lambda s, slot: s.events.restarted(slot), "station_restarted")
 _callback(
     lambda s, sender, slot, data, n, arrival, ok: s.events.heard(sender, slot, _bytes(data, n), arrival, bool(ok)),

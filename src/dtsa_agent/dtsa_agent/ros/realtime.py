@@ -26,14 +26,13 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 
 from dtsa_agent.air.driver import AgentVehicle
-from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core import station as core
 from dtsa_agent.core.agent import REFUSED
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator
-from dtsa_agent.core.station import Link, Station, StationSettings
+from dtsa_agent.core.station import ClockMap, Link, Station, StationSettings
 from dtsa_agent.core.swarm import Presence
 from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
@@ -125,7 +124,7 @@ class RealtimeAgent:
 
     # Events of the station.
 
-    def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
+    def opened(self, slot: int, start_ns: int, is_first: bool) -> None:
         self._opened = True
 
     def restarted(self, slot: int) -> None:
@@ -172,7 +171,7 @@ class RealtimeNode(AgentsNode):
         self._telemetry = node.create_publisher(Report, f"{swarm_namespace}/{names.REPORT}", qos)
         self._reporter = Reporter(self._telemetry, config, ids)
         scenario = make_scenario(config)
-        clocks = clocks or [ClockMap(began_ns=0)] * len(ids)
+        clocks = clocks or [ClockMap()] * len(ids)
         self.agents = [
             RealtimeAgent(agent, index, config, scenario, clock, jitter_ns, self._reporter)
             for index, (agent, clock) in enumerate(zip(ids, clocks, strict=True))

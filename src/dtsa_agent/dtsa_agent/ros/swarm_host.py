@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 from rclpy.node import Node
 
-from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.settings.declaration import Setting, setting
+from dtsa_agent.core.station import ClockMap
 from dtsa_agent.keys import authenticator, with_key
 from dtsa_agent.priority import PrioritySettings, set_nice
 from dtsa_agent.ros.common import names
@@ -126,7 +126,7 @@ def _realtime_node(node: Node, config: SwarmConfig, ids: Sequence[int], space: s
         set_nice(host.nice)
     return RealtimeNode(
         node, config, ids, space, authenticator=authenticator(config), jitter_ns=host.clock_jitter_ns, align=host.align,
-        clocks=[ClockMap(*clock, 0) for clock in zip(offset, drift, strict=True)], priority=host.priority,
+        clocks=[ClockMap(*clock) for clock in zip(offset, drift, strict=True)], priority=host.priority,
         flight_time_ns=fixed + per_byte * config.frame_length, resume_at=places if len(places) > 1 else (),
     )  # fmt: skip
 

@@ -1,7 +1,8 @@
-"""Whether an agent may fly, and what it prints of that."""
+"""Whether an agent may fly, what it prints, and what its summary counts."""
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -9,10 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.air.port import link_of
-from dtsa_agent.air.record import Reports
+from dtsa_agent.air.record import AgentReports
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
-from dtsa_agent.core.station import ALL_BUT_ONE, STATES, HoverReason, Station, StationSettings
+from dtsa_agent.core.station import (
+    ALL_BUT_ONE,
+    LENGTH,
+    OTHER_SETTINGS,
+    REJECTED,
+    STATES,
+    HoverReason,
+    Station,
+    StationSettings,
+)
 
 SECOND = 10**9
 
@@ -57,7 +67,7 @@ def status(hovers: int, hears: int, heard_by: int, state: int = 2) -> SimpleName
 
 def test_a_state_that_lasts_is_printed_once() -> None:
     lines: list[str] = []
-    reports = Reports(1, 10.0, lines.append, 0)
+    reports = AgentReports(1, 10.0, lines.append, 0)
     reports.status(status(HoverReason.IS_NEW, 2, 1), SECOND // 2)
     reports.status(status(HoverReason.NONE, 5, 5), SECOND)
     assert lines == []  # a start takes a moment
@@ -78,7 +88,60 @@ def test_a_state_that_lasts_is_printed_once() -> None:
 
 def test_an_agent_that_hears_nobody_says_that_it_is_alone() -> None:
     lines: list[str] = []
-    reports = Reports(1, 10.0, lines.append, 0)
+    reports = AgentReports(1, 10.0, lines.append, 0)
     for second in range(10):
         reports.status(status(HoverReason.NO_QUORUM, 0, 0, STATES.index("alone")), second * SECOND)
     assert lines == ["is alone, and hovers until it hears others"]
+
+
+#: Of a station that has done nothing yet.
+NOTHING = SimpleNamespace(
+    slots=0, sent=0, unsent=0, heard=0, state=0, restarts=0, shifts=0, alignments=0, flight_error_ns=0
+)
+
+
+def test_summaries_tell_how_late_frames_left() -> None:
+    reports = AgentReports(1, 10.0, None, 0)
+    assert reports.summary(NOTHING, (0, 0))["sends_on_time_share"] is None
+    for late in (0, 50_000, 60_000, 3_000_000):
+        reports.count_transmission(late, 0)
+    found = reports.summary(SimpleNamespace(**vars(NOTHING) | {"sent": 4}), (0, 0))
+    assert found["sends_on_time_share"] == 0.75
+    assert found["send_late_ms"] == {"p50": pytest.approx(0.05, rel=0.05), "p99": 3.0, "max": 3.0}
+
+
+def test_the_share_of_agents_heard_counts_from_when_it_could_fly() -> None:
+    reports = AgentReports(1, 10.0, None, 0)
+    reports.status(status(HoverReason.IS_NEW, 0, 0), 0)
+    found = reports.summary(NOTHING, (0, 0))
+    assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (None, None, None)
+    for hears in (5, 2):
+        reports.status(status(HoverReason.NONE, hears, 5), 0)
+    found = reports.summary(NOTHING, (63, 3))
+    assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (0.7, 63, 3)
+
+
+def test_other_settings_and_another_key_are_said_in_flight() -> None:
+    """A second after the first such datagram, with counts; then not again for a while."""
+    lines: list[str] = []
+    now = [0]
+    reports = AgentReports(1, 10.0, lines.append, 0)
+
+    def arrives(*faults: str) -> list[str]:
+        for fault in faults:
+            reports.count_refused(fault, now[0])
+        reports.status(status(HoverReason.NONE, 5, 5), now[0])
+        return [line for line in lines if "datagrams" in line]
+
+    assert arrives(OTHER_SETTINGS, REJECTED, OTHER_SETTINGS, LENGTH) == []
+    now[0] += SECOND - 1
+    assert arrives() == []
+    now[0] += 1
+    (line,) = arrives()
+    assert re.fullmatch("datagrams not taken in so far: 2 of other settings: slot length.*; 1 of another key.*", line)
+    now[0] += 20 * SECOND
+    assert len(arrives(REJECTED)) == 1
+    now[0] += 10 * SECOND
+    assert "; 2 of another key" in arrives()[1]
+    now[0] += 1000 * SECOND
+    assert len(arrives()) == 2

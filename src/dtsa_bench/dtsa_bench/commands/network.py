@@ -131,14 +131,15 @@ environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
 
     def run(self, args: argparse.Namespace) -> int:
         """Fly until Ctrl-C, and print what came of it."""
-        from dtsa_bench.network.flying import AgentJob, check, fly
+        from dtsa_bench.network.flying import check, fly
 
         port, config = read_network_options(args)
         own = AgentSettings.from_dict(option_values(args, AgentSettings, "own"))
         check_joinable(config.policy)  # before anything is made
         check_fits(config, port.properties)
-        job = AgentJob(own, config, port, args.out, args.json)
-        return fly(job) if args.check is None else check(job, number(args.check, "check", 0, 3600))
+        if args.check is not None:
+            return check(own, config, port, number(args.check, "check", 0, 3600), args.json)
+        return fly(own, config, port, args.out, args.json)
 
 
 class SniffCommand(Command):

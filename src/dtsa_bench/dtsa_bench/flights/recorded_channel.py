@@ -31,10 +31,9 @@ from dtsa_channel_sim.ros.channel_node import follow_parameters, watch
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .measurement import FlightMeasurement
+from .measurement import FlightMeasurement, TimingStatistics, channel_summary, warning
 from .recorder import FlightRecorder
 from .slot_messages import LiveTopics
-from .statistics import TimingStatistics, channel_summary, warning
 
 BAG = "bag"  # the bag's directory within a flight's directory
 
@@ -67,14 +66,14 @@ class RecordedFlight:
             if run.mode == LOCKSTEP
             else RealtimeChannel(node, model, steps, over=over, **limits)
         )
+        self._timing = TimingStatistics(run.swarm.agents)
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
-            FlightRecorder(directory / BAG, run, self.scenario, self.run_id),
+            FlightRecorder(directory / BAG, run, self.scenario, self.run_id, self._timing),
             self.measurement,
             LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id, space),
         )
         watch(self.channel, node, run.to_dict(), space)
-        self._timing = TimingStatistics(run.swarm.agents)
         if run.mode != LOCKSTEP:
             self.channel.observe(self._timing)
         follow_parameters(node, model, self.channel.change_settings)

@@ -30,6 +30,7 @@ from dtsa_channel_sim.ros.answers import Answers, received_in
 from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.run_topics import RunState, configuration_message
 
+from .measurement import TimingStatistics
 from .slot_messages import SlotMessages
 
 _WAIT_NS = 10_000_000_000  # for reports of agents that are not lost: a channel that stood still gets them late
@@ -43,7 +44,9 @@ class FlightRecorder(ChannelObserver):
     that is cut short leaves half done does not get into its bag.
     """
 
-    def __init__(self, directory: Path, run: RunConfig, scenario: Scenario, run_id: int) -> None:
+    def __init__(
+        self, directory: Path, run: RunConfig, scenario: Scenario, run_id: int, timing: TimingStatistics
+    ) -> None:
         self._slot_ns, self._steps, self._run_id = run.swarm.slot_ns, run.swarm.steps, run_id
         self._packed = SlotMessages(scenario, self._slot_ns, run_id)
         agents = run.swarm.agents
@@ -59,6 +62,7 @@ class FlightRecorder(ChannelObserver):
         self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
         self._packer = OdometryPacker([names.body_frame(space) for space in spaces])
         self._accounts = None if run.mode == LOCKSTEP else RealtimeAccounts(agents, self._steps, self._slot_ns)
+        self._timing = timing
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1
         self._complete = -1  # last slot that all have answered,
@@ -117,8 +121,9 @@ class FlightRecorder(ChannelObserver):
 
     def _write_accounts(self, closed: int, at_end: bool = False) -> None:
         """Write the records of slots in real time for which nothing is waited for any more."""
-        for slot, fields in self._accounts.pop(closed, at_end) if self._accounts is not None else ():
-            self._write_record(slot, fields)
+        for slot, account in self._accounts.pop(closed, at_end) if self._accounts is not None else ():
+            self._timing.add_slot(account.answered, account.sent, account.offset_ns)
+            self._write_record(slot, account.fields(slot * self._slot_ns))
 
     def _write_record(self, slot: int, fields: dict[str, Any]) -> None:
         at = self._time_ns(slot)
@@ -174,12 +179,32 @@ class _Account(Answers):
         self.sent_frames: dict[int, _SentFrame] = {}  # by sender
         self.heard: list[tuple[int, int, int, NDArray[np.bool_]]] = []  # sender, its slot, ns, (N,) receivers
 
+    def fields(self, start_ns: int) -> dict[str, Any]:
+        """The fields of the slot's record; ``start_ns``: when it began, from the start of slot 0."""
+        here = np.flatnonzero(self.answered)
+        frames = {agent: frame for agent, frame in sorted(self.sent_frames.items()) if frame.verdict is not None}
+        verdicts = [frame.verdict for frame in frames.values() if frame.verdict is not None]
+        received = np.array([verdict[0] for verdict in verdicts]) if verdicts else None
+        heard, unrecorded = self.heard, self.sent.copy()
+        unrecorded[np.array(list(frames), np.intp) - 1] = False
+        presence = PRESENT + UNRECORDED * unrecorded[here] if unrecorded.any() else []
+        return {
+            "outcome": (COLLISION if any(v[2] for v in verdicts) else SUCCESS) if verdicts else IDLE,
+            "agent": here + 1, "presence": presence, **{name: getattr(self, name)[..., here] for name in _REPORTED},
+            **frame_fields({agent: frame.data for agent, frame in frames.items()}, received),
+            "sent_ns": [frame.start_ns - start_ns for frame in frames.values()],
+            "lost": [verdict[1] for verdict in verdicts], "collided": [verdict[2] for verdict in verdicts],
+            "heard_sender": [entry[0] for entry in heard], "heard_slot": [entry[1] for entry in heard],
+            "heard_ns": [entry[2] - start_ns for entry in heard],
+            "heard_by": np.frombuffer(pack_received(np.array([e[3] for e in heard])), np.uint8) if heard else [],
+        }  # fmt: skip
+
 
 class RealtimeAccounts:
     """Slots of which not all is known yet, by what agents report and the channel decides."""
 
     def __init__(self, agents: int, steps: int, slot_ns: int) -> None:
-        self._agents, self._steps, self._slot_ns = agents, steps, slot_ns
+        self._agents, self._steps = agents, steps
         self._wait = max(2, _WAIT_NS // slot_ns)
         self._open: dict[int, _Account] = {}
         self._next = 0  # first slot that is not written
@@ -223,13 +248,13 @@ class RealtimeAccounts:
             receivers[at] = mask
             self._account(here).heard.append((sender, slot, at_ns, receivers))
 
-    def pop(self, closed: int, at_end: bool) -> list[tuple[int, dict[str, Any]]]:
-        """The fields of records up to the last closed slot for which nothing is waited for any more, by slot."""
+    def pop(self, closed: int, at_end: bool) -> list[tuple[int, _Account]]:
+        """Slots up to the last closed one for which nothing is waited for any more, and what is known of them."""
         found = []
         while self._next <= closed and (at_end or self._next <= closed - self._wait or self._is_whole(self._next)):
             account = self._account(self._next)
             self._open.pop(self._next)
-            found.append((self._next, self._fields(self._next, account)))
+            found.append((self._next, account))
             self._next += 1
         return found
 
@@ -242,25 +267,6 @@ class RealtimeAccounts:
         if silent - self.lost:
             return False
         return all(frame.verdict is not None for frame in here.sent_frames.values())
-
-    def _fields(self, slot: int, account: _Account) -> dict[str, Any]:
-        start_ns, here = slot * self._slot_ns, np.flatnonzero(account.answered)
-        frames = {agent: frame for agent, frame in sorted(account.sent_frames.items()) if frame.verdict is not None}
-        verdicts = [frame.verdict for frame in frames.values() if frame.verdict is not None]
-        received = np.array([verdict[0] for verdict in verdicts]) if verdicts else None
-        heard, unrecorded = account.heard, account.sent.copy()
-        unrecorded[np.array(list(frames), np.intp) - 1] = False
-        presence = PRESENT + UNRECORDED * unrecorded[here] if unrecorded.any() else []
-        return {
-            "outcome": (COLLISION if any(v[2] for v in verdicts) else SUCCESS) if verdicts else IDLE,
-            "agent": here + 1, "presence": presence, **{name: getattr(account, name)[..., here] for name in _REPORTED},
-            **frame_fields({agent: frame.data for agent, frame in frames.items()}, received),
-            "sent_ns": [frame.start_ns - start_ns for frame in frames.values()],
-            "lost": [verdict[1] for verdict in verdicts], "collided": [verdict[2] for verdict in verdicts],
-            "heard_sender": [entry[0] for entry in heard], "heard_slot": [entry[1] for entry in heard],
-            "heard_ns": [entry[2] - start_ns for entry in heard],
-            "heard_by": np.frombuffer(pack_received(np.array([e[3] for e in heard])), np.uint8) if heard else [],
-        }  # fmt: skip
 
 
 def _parameter_event(time_ns: int, node: str, change: Change) -> bytes:

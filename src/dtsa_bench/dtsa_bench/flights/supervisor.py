@@ -17,8 +17,7 @@ from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S, RealtimeChannel
 
 from .children import Child, Children, NodeError, describe_end
-from .measurement import FlightMeasurement
-from .statistics import tight
+from .measurement import FlightMeasurement, tight
 
 
 class Supervisor(ChannelObserver):

@@ -10,7 +10,7 @@ import json
 import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from dtsa_agent.air.driver import LiveAgent
@@ -20,72 +20,63 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.stop import Stop
 
 
-@dataclass(frozen=True, slots=True)
-class AgentJob:
-    """What one agent is to do."""
+def check(own: AgentSettings, config: SwarmConfig, port: PortSettings, seconds: float, as_json: bool) -> int:
+    """Fly with the vehicle held, and print who is heard, and by whom.
 
-    own: AgentSettings
-    config: SwarmConfig
-    port: PortSettings
-    out: str | None  # directory for its bag and summary; None: there are none
-    as_json: bool  # print the result as JSON
-
-
-def check(job: AgentJob, seconds: float) -> int:
-    """Fly with the vehicle held, for seconds (0: as long as it takes), and print who is heard, and by whom.
-
+    :param seconds: for so long; 0: as long as it takes.
+    :param as_json: print the result as JSON.
+    :returns: the exit code: 0 if all hear all in time.
     :raises ConfigError: for a port or an id that cannot be used.
     """
     from .check import Check, HeldVehicle, lasts_s, table
 
-    duration = seconds or lasts_s(job.config)
-    own = dataclasses.replace(job.own, duration_s=duration, quorum="0")  # it hovers anyway
+    own = dataclasses.replace(own, duration_s=seconds or lasts_s(config), quorum="0")  # it hovers anyway
     log = _Terminal(own.id).log
-    log(f"checks for {duration:.0f} s who is heard; its vehicle is held")
-    watcher = Check(own.id, job.config, job.port.properties)
-    with Stop() as stop, open_port(job.port) as port:
-        LiveAgent(own, job.config, port, watcher, HeldVehicle(), log=log).run(stop)
+    log(f"checks for {own.duration_s:.0f} s who is heard; its vehicle is held")
+    watcher = Check(own.id, config, port.properties)
+    with Stop() as stop, open_port(port) as opened:
+        LiveAgent(own, config, opened, watcher, HeldVehicle(), log=log).run(stop)
     result = watcher.result()
-    print(json.dumps(result, indent=2) + "\n" if job.as_json else table(result), end="")
+    print(json.dumps(result, indent=2) + "\n" if as_json else table(result), end="")
     if result["missing"]:
         log(f"not all hear all in time: {'; '.join(result['missing'])}")
     return int(bool(result["missing"]))
 
 
-def fly(job: AgentJob) -> int:
-    """Flies until a signal comes, and prints what came of it.
+def fly(own: AgentSettings, config: SwarmConfig, port: PortSettings, out: str | None, as_json: bool) -> int:
+    """Fly until a signal comes, and print what came of it.
 
+    :param out: directory for its bag and summary; None: there are none.
+    :param as_json: print the summary as JSON.
+    :returns: the exit code: 0 if it has heard what arrived, and has flown.
     :raises ConfigError: for a port, a directory or an id that cannot be used.
     :raises BagError: if the record is not whole.
     """
-    failure = ""
-    terminal = _Terminal(job.own.id)
-    show = terminal.show if sys.stderr.isatty() else None
-    with Stop() as stop, open_port(job.port) as port:
-        agent = LiveAgent(job.own, job.config, port, log=terminal.log, show=show)
-        if job.out is None:
-            agent.run(stop)
-            summary = agent.summary()
-        else:
+    terminal = _Terminal(own.id)
+    with Stop() as stop, open_port(port) as opened:
+        agent = LiveAgent(own, config, opened, log=terminal.log, show=terminal.show if sys.stderr.isatty() else None)
+        record: AbstractContextManager[Any] = nullcontext()
+        if out is not None:
             from dtsa_bench.log.agent_bag import recorded
 
-            with recorded(job.out, agent, job.port) as recorder:
-                agent.run(stop)
-            summary, failure = recorder.summary, recorder.failure
+            record = recorded(out, agent, port)
+        with record as recorder:
+            agent.run(stop)
+        summary = agent.summary() if recorder is None else recorder.summary
     from dtsa_bench.runs.delivery import counts_of_datagrams
 
     terminal.clear()
-    print(json.dumps(summary, indent=2) if job.as_json else brief(summary))
+    print(json.dumps(summary, indent=2) if as_json else brief(summary))
     not_taken_in = summary["not_taken_in"]
     # Two: this agent, and all others.
     hearing = counts_of_datagrams(2, summary["slots"], summary["sent"], summary["heard"], not_taken_in)
     heard_too_little = hearing.problem(not_taken_in) if hearing.delivered else ""  # who is alone hears nobody
     if problem := heard_too_little or summary["never_flew"]:
         terminal.log(problem)
-    if failure:
+    if recorder is not None and recorder.failure:
         from dtsa_bench.log.bag.errors import BagError
 
-        raise BagError(failure)
+        raise BagError(recorder.failure)
     return int(bool(problem))
 
 

@@ -49,13 +49,13 @@ class Sniffer:
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
         self._zero_ns = time.monotonic_ns()
-        self._listener: Any = open_port(port)
+        self._listener = open_port(port)
         self._listener.log = log
         about = {"port": dataclasses.asdict(port.properties), "port_settings": port.to_dict(), "zero_ns": self._zero_ns}
         try:
             self.bag = None if path is None else RecordFile(path, config, {SNIFFER: json.dumps(about, sort_keys=True)})
         except DtsaError:
-            self._listener.__exit__()
+            self._listener.close()
             raise
 
     def run(self, stop: Stop, seconds: float = 0.0) -> None:
@@ -108,8 +108,8 @@ class Sniffer:
         }
 
     def close(self) -> None:
-        """Ends the record, and leaves the air."""
-        self._listener.__exit__()
+        """End the record, and leave the air."""
+        self._listener.close()
         if self.bag is not None:
             self.bag.close()
 

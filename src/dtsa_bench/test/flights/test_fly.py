@@ -62,11 +62,11 @@ def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_pa
 def test_slots_of_a_clock_start_when_that_clock_says_so() -> None:
     from drifting_clocks import to_channel
 
-    from dtsa_agent.air.port import ClockMap
+    from dtsa_agent.core.station import ClockMap
 
     config = ClockConfig(offset_ns=2_000_000, drift_ppm=50.0, seed=3)
     clocks = make_clocks(config, 6)
-    maps = [ClockMap(clock.offset_ns, clock.drift_ppb, 0) for clock in clocks]
+    maps = [ClockMap(clock.offset_ns, clock.drift_ppb) for clock in clocks]
     for slot in (0, 1, 777, 60_000):
         local = slot * 10_000_000
         expected = [to_channel(clock, local) - local for clock in clocks]

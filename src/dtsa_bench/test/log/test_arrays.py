@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_bench.flights.statistics import TimingStatistics
+from dtsa_bench.flights.measurement import TimingStatistics
 from dtsa_bench.log.verify.on_air import FramesOnAir
 from dtsa_bench.log.verify.result import Mismatch
 from dtsa_channel_sim import Air, Channel, ChannelConfig
@@ -100,15 +99,8 @@ def test_each_receiver_counts_once_and_a_sender_not_at_all() -> None:
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:
     statistics = TimingStatistics(3)
-
-    def report(slots: list[int], agents: list[int], offsets_ns: list[int], lengths: list[int]) -> None:
-        values = {"slot": slots, "agent": agents, "offset_ns": offsets_ns, "length": lengths}
-        statistics.report(SimpleNamespace(**{name: np.array(value, np.int64) for name, value in values.items()}))
-
-    report([0, 1], [1, 2], [0, 400_000, 100_000, 0], [0, 0, 0, 24])
-    report([0], [3], [3_200_000], [24])  # late by 3 ms: not a clock that is off
-    report([1], [3], [100_000], [0])
-    report([], [1, 2], [], [])  # nothing but what was heard
+    for offsets_ns, sends in (([0, 400_000, 3_200_000], [0, 0, 1]), ([100_000, 0, 100_000], [0, 1, 0])):
+        statistics.add_slot(np.ones(3, np.bool_), np.array(sends, np.bool_), np.array(offsets_ns))  # 3 ms late
     summary = statistics.summary()
     assert summary["clock_spread_max_ms"] == pytest.approx(0.4)
     assert summary["clock_spread_mean_ms"] == pytest.approx(0.2)

@@ -189,7 +189,7 @@ def _recorded(
     with AgentRecorder(path, AgentSettings(id=1), CONFIG, UdpSettings(interface="lo")) as recorder:
         for at, slot in enumerate(slots):
             is_first = at == 0 or slot < slots[at - 1]
-            recorder.slot(SlotRecord(slot, 0, 0, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
+            recorder.slot(SlotRecord(slot, 0, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
         custom = recorder._bag.custom_data
         custom[AGENT] = json.dumps(json.loads(custom[AGENT]) | (about or {}))
     return read(path)

@@ -81,7 +81,7 @@ def _disturb(stranger: UdpPort, flying: list[helpers.Flying]) -> None:
 
     def repeats() -> bool:
         stranger.send(helpers.hear(stranger, 1)[-1])
-        return all(one.agent.counts.refused["repeated"] for one in flying)
+        return all(one.agent.reports.not_taken_in["repeated"] for one in flying)
 
     wait_for(repeats)
     kept = helpers.hear(stranger, 6)  # of two at least: to its sender an old datagram is a repeated one

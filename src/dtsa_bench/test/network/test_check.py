@@ -25,7 +25,7 @@ NONE = np.zeros(3)
 
 def record(slot: int, chosen: int, heard: list[ReceivedFrame], is_first: bool = False) -> SlotRecord:
     start, track = slot * SLOT, np.zeros((1, 3))
-    return SlotRecord(slot, start, start, is_first, 1, chosen, 0, 0, 0.0, track, NONE, NONE, NONE, heard=heard)
+    return SlotRecord(slot, start, is_first, 1, chosen, 0, 0, 0.0, track, NONE, NONE, NONE, heard=heard)
 
 
 def said(sender: int, slot: int, delay_ns: int, hears: Sequence[int]) -> ReceivedFrame:

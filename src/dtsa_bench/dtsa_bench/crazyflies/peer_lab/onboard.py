@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import dtsa_agent
-from dtsa_agent.air.record import ReceivedFrame, SlotRecord
+from dtsa_agent.air.record import ReceivedFrame, SlotRecord, SlotRecords
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
@@ -45,47 +45,33 @@ class _AgentFlight:
     def __init__(self, agent: int, config: SwarmConfig, path: Path) -> None:
         # The vehicle's clock begins when it is switched on.
         self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _PeerPort(), not config.targets_known, 0)
-        self._record: SlotRecord | None = None
-        self._before: list[ReceivedFrame] = []
-        self._slots = config.steps
+        self._records = SlotRecords(self._recorder)
+        self._steps = config.steps
 
     def note(self, data: bytes) -> None:
-        """Takes in what the app has noted."""
+        """Receive what the app has noted."""
         if data[:1] == b"O":
             self._open(data)
             return
         kind, accepted, sender, length, slot, at_ns, frame = _HEARD.unpack(data)
         if kind == ord("S"):
-            if self._record is not None:
-                self._record.sent_ns, self._record.datagram = at_ns, frame[:length]
+            self._records.transmit(at_ns, frame[:length])
         elif kind == ord("A"):
-            self.close_slot()
-            self._before.clear()
+            self._records.restart()
         else:
-            heard = ReceivedFrame(sender, slot, at_ns, frame[:length], bool(accepted))
-            (self._before if self._record is None else self._record.heard).append(heard)
+            self._records.receive(ReceivedFrame(sender, slot, at_ns, frame[:length], bool(accepted)))
 
     def _open(self, data: bytes) -> None:
-        _, is_first, reason, length, slot, start, opened, present, chosen, digest, score, *rest = _OPENED.unpack(data)
-        self.close_slot()
-        position, velocity, command, goal = (np.array(rest[3 * i : 3 * i + 3]) for i in range(4))
-        frame, before = rest[12][:length], self._before
-        self._before = []
-        track = np.repeat(position[None], self._slots, axis=0)
-        self._record = SlotRecord(
-            slot, start, opened, bool(is_first), present, chosen, reason, digest, score, track, velocity, command, goal,
-            frame, before=before,
-        )  # fmt: skip
-
-    def close_slot(self) -> None:
-        """The present slot is over."""
-        if self._record is not None:
-            self._recorder.slot(self._record)
-            self._record = None
+        _, is_first, reason, _, slot, start, _, present, chosen, digest, score, *vectors, _ = _OPENED.unpack(data)
+        position, velocity, command, goal = np.array(vectors).reshape(4, 3)
+        track = np.repeat(position[None], self._steps, axis=0)
+        self._records.open(SlotRecord(
+            slot, start, bool(is_first), present, chosen, reason, digest, score, track, velocity, command, goal
+        ))  # fmt: skip
 
     def finish(self) -> None:
         """The flight is over."""
-        self.close_slot()
+        self._records.close()
         self._recorder.finish({"ended": True})
         self._recorder.__exit__()
 
