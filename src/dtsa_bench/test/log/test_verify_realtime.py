@@ -55,7 +55,11 @@ def rewritten(original: Path, copy: Path, edit: Edit, **config: Any) -> Result:
         for message in bag.messages():
             data: bytes | None = message.data
             if message.topic == SLOT_RECORD:
-                data = edit(message, bag.decode(message), lambda value: bytes(bag.typestore.serialize_cdr(value, TYPE)))
+                data = edit(
+                    message,
+                    bag.decode(message),
+                    lambda value: bytes(bag.typestore(SLOT_RECORD).serialize_cdr(value, TYPE)),
+                )
             if data is not None:
                 writer.write(channels[message.topic], data, message.log_time_ns, message.publish_time_ns)
         writer.close()
