@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 import zstandard
 from mcap.records import Metadata
-from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from .errors import UnusableBag
 
@@ -150,11 +150,6 @@ def write(directory: Path, content: Mapping[str, Any]) -> None:
 
 # -- quality of service -----------------------------------------------------------------------------------------------
 INFINITE = {"sec": 9223372036, "nsec": 854775807}  # the middleware's "for ever", as rosbag2 splits it
-_POLICIES = {
-    "history": QosHistory, "reliability": QosReliability, "durability": QosDurability, "liveliness": QosLiveliness,
-}  # fmt: skip
-
-
 _PROFILE: Profile = {
     "history": "keep_last", "depth": 10, "reliability": "reliable", "durability": "volatile", "deadline": INFINITE,
     "lifespan": INFINITE, "liveliness": "automatic", "liveliness_lease_duration": INFINITE,
@@ -180,13 +175,6 @@ def load_profiles(text: str) -> tuple[Profile, ...]:
     Before Jazzy rosbag2 wrote policies as numbers.
     """
     try:
-        loaded = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError):
+        return tuple(dict(entry) for entry in dump_qos_v9(parse_qos(yaml.load(text, Loader=_Loader))))
+    except Exception:  # the library meets texts from outside with many kinds of errors
         return ()
-    profiles = [dict(entry) for entry in loaded if isinstance(entry, dict)] if isinstance(loaded, list) else []
-    for entry in profiles:
-        for name, policy in _POLICIES.items():
-            numbers = {member.value: member.name.lower() for member in policy}
-            if isinstance(entry.get(name), int):
-                entry[name] = numbers.get(entry[name], "unknown")
-    return tuple(profiles)
