@@ -59,7 +59,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
         files = [BagFile(part, path, stack) for part in paths]
         profile, about = _begin(files, path)
         custom_data = {**metadata.custom_data(about), metadata.RECOVERED_FROM: result.source.name}
-        with BagWriter(result.directory, None, custom_data=custom_data, min_time_ns=0, profile=profile) as writer:
+        with BagWriter(result.directory, None, custom_data=custom_data, profile=profile) as writer:
             copy = _Copy(writer, metadata.has_packed_messages(about))
             for file in files:
                 copy.add(file)
