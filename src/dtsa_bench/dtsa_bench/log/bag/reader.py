@@ -75,12 +75,13 @@ class Bag:
         if file.index_fault:
             raise self._damaged(f"it was not closed, or is damaged ({file.index_fault})")
         summary = file.summary
-        for number, channel in sorted(summary.channels.items()):
+        for _, channel in sorted(summary.channels.items()):
             definition = Definition.of_channel(channel, summary.schemas.get(channel.schema_id))
             profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
             before = self.topics.get(channel.topic) or Topic(channel.topic, definition, profiles)
-            count = before.count + file.counts.get(number, 0)
-            self.topics[channel.topic] = Topic(channel.topic, definition, profiles or before.profiles, count)
+            self.topics[channel.topic] = Topic(channel.topic, definition, profiles or before.profiles, before.count)
+        for topic in self.topics.values():
+            topic.count += file.counts[topic.name]
 
     def _damaged(self, what: str) -> UnusableBag:
         return UnusableBag(self.given, f"{what}; `{program()} recover {self.given}` saves what can be read")
