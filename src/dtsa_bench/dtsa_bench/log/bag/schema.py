@@ -45,14 +45,6 @@ class Definition:
         """Of messages and definition; READABLE alone can be decoded."""
         return f"{self.message_encoding}/{self.encoding or 'no schema'}"
 
-    @classmethod
-    def of_channel(cls, channel: Channel, schema: Schema | None) -> Definition:
-        """What a file says of the type of a channel's messages."""
-        type_hash, encoding = channel.metadata.get("topic_type_hash", ""), channel.message_encoding
-        if schema is None:
-            return cls("", "", type_hash, "", encoding)
-        return cls(schema.name, schema.data.decode("utf-8", "surrogateescape"), type_hash, schema.encoding, encoding)
-
 
 @dataclass(slots=True)
 class Topic:
@@ -67,6 +59,15 @@ class Topic:
     def type(self) -> str:
         """ "package/msg/Type"."""
         return self.definition.name
+
+    @classmethod
+    def of_channel(cls, channel: Channel, schema: Schema | None) -> Topic:
+        """What a file says of a channel."""
+        text = "" if schema is None else schema.data.decode("utf-8", "surrogateescape")
+        name, encoding = ("", "") if schema is None else (schema.name, schema.encoding)
+        type_hash = channel.metadata.get("topic_type_hash", "")
+        definition = Definition(name, text, type_hash, encoding, channel.message_encoding)
+        return cls(channel.topic, definition, metadata.load_profiles(channel.metadata.get("offered_qos_profiles", "")))
 
 
 @lru_cache(maxsize=128)  # compiling a type takes longer than reading most bags
