@@ -32,8 +32,9 @@ from dtsa_agent.ros.common.cdr import ns_of, pack_received
 from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS, ReceivedFrames
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, UnusableBag
-from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, checksum_fault, register_type, shared_typestore
-from dtsa_bench.log.bag.recover import RecordScan
+from dtsa_bench.log.bag.file import BagFile
+from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE
+from dtsa_bench.log.bag.schema import Definition, typestore_of
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.record import (
@@ -297,10 +298,12 @@ def read(path: str | Path) -> AgentBag:
         raise UnusableBag(file, error.strerror or str(error)) from None
     reader = _Reader()
     with ExitStack() as stack:
-        scan = RecordScan(file, path, stack)
+        scan, damage = BagFile(file, path, stack), ""
         for record in scan.records():
             if scan.faults or not reader.add(record):
                 break
+        if scan.is_finished or scan.is_closed:
+            damage = scan.faults[0] if scan.faults else scan.checksum_fault()
     if not reader.custom:
         why = f"not readable ({scan.faults[0]})" if scan.faults else (
             f"no bag of an agent on a network, as `{program()} agent --out` makes them")  # fmt: skip
@@ -312,9 +315,7 @@ def read(path: str | Path) -> AgentBag:
         bag = _make_bag(file, reader.custom, reader.records)
     except (ConfigError, LookupError, ValueError, TypeError, AttributeError, OverflowError) as error:
         raise UnusableBag(file, f"what it says of its agent cannot be read ({error})") from None
-    bag.broken_off = bag.broken_off or not is_finished
-    if scan.is_finished or scan.is_closed:
-        bag.damage = scan.faults[0] if scan.faults else checksum_fault(file)
+    bag.broken_off, bag.damage = bag.broken_off or not is_finished, damage
     return bag
 
 
@@ -335,8 +336,7 @@ class _Reader:
                 self._channel = record.id
             elif isinstance(record, Schema) and record.name == TYPE:
                 definition = record.data.decode()
-                self._store = shared_typestore(frozenset({(TYPE, definition)}))
-                register_type(self._store, TYPE, definition)
+                self._store = typestore_of(Definition(TYPE, definition, ""))
             elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
                 custom = metadata.custom_data(metadata.load_record(record))
                 self.custom |= custom if AGENT in custom else {}
@@ -348,7 +348,7 @@ class _Reader:
 
     def _add_message(self, record: Message) -> None:
         times = record.log_time, record.publish_time, record.sequence
-        self.digest.add(SLOT_RECORD.encode(), *times, record.data, True)
+        self.digest.add(SLOT_RECORD, TYPE, *times, record.data)
         message: Any = self._store.deserialize_cdr(record.data, TYPE)
         if len(message.agent) != 1 or len(message.presence) != 1:
             raise ValueError("not of one agent")
