@@ -15,9 +15,9 @@ from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings, UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
-from dtsa_bench.log.agent_bag import AgentBag, AgentRecorder, NothingWritten, read
+from dtsa_bench.log.agent_bag import AgentBag, AgentRecorder, read
 from dtsa_bench.log.arrays import split_log
-from dtsa_bench.log.bag.errors import UnusableBag
+from dtsa_bench.log.bag.errors import NothingWritten, UnusableBag
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merge.timeline import Crossings, both_ways, fit
 from dtsa_bench.log.merged_flight import MergedReplay, slots_until_all_known
