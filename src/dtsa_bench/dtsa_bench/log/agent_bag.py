@@ -31,7 +31,7 @@ from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS, ReceivedFrames
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, NothingWritten, UnusableBag
-from dtsa_bench.log.bag.reader import Bag, BagMessage, checksum_fault
+from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
 from dtsa_bench.log.flight_log import FlightLog
@@ -291,12 +291,16 @@ def read(path: str | Path) -> AgentBag:
             raise NothingWritten(file, "is empty")
         with ExitStack() as stack:
             try:
-                bag, damage = stack.enter_context(Bag(file)), checksum_fault(file)
+                bag, damage = stack.enter_context(Bag(file)), ""
                 messages = list(bag.messages())
             except UnusableBag:
                 saved = recover(file, Path(stack.enter_context(TemporaryDirectory())) / file.name)
                 bag, damage = stack.enter_context(Bag(saved.directory)), saved.damaged[0] if saved.has_end else ""
                 messages = list(bag.messages())
+            try:
+                bag.check_files()
+            except UnusableBag as error:
+                damage = error.reason
             return _read_bag(file, bag, messages, damage)
     except UnusableBag as error:
         raise type(error)(file, error.reason) from None
@@ -315,7 +319,7 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
     if messages:
         check_format(bag)
     for one in messages:
-        digest.add(one.topic.encode(), one.log_time_ns, one.publish_time_ns, one.sequence, one.data, True)
+        digest.add(one.topic, one.type, one.log_time_ns, one.publish_time_ns, one.sequence, one.data)
     if custom.get(KEY, digest.hexdigest()) != digest.hexdigest():
         raise UnusableBag(file, "a message was changed, left out, added or moved after the recording")
     try:

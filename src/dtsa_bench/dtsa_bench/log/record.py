@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import SECOND, ns_of, pack_received, split_frames, unpack_received
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
-from dtsa_bench.log.bag.reader import Bag, register_type
+from dtsa_bench.log.bag.reader import Bag
 
 from .arrays import DECIDED, PRESENT, UNKNOWN, VECTORS, ReceivedFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
@@ -38,23 +37,21 @@ _NOTHING = {name: np.zeros(0, kind) for name, kind in _KINDS.items()}
 
 
 @cache
-def _store() -> Any:
-    store = get_typestore(Stores.EMPTY)
-    for kind in (TYPE, CONFIGURATION):
-        register_type(store, kind, schema.installed(kind).text)
-    return store
+def _store(kind: str) -> Any:
+    return schema.typestore_of(schema.installed(kind))
 
 
 def _header(time_ns: int) -> Any:
-    stamp = _store().types["builtin_interfaces/msg/Time"](*divmod(time_ns, SECOND))
-    return _store().types[_HEADER](stamp, names.FRAME)
+    types = _store(TYPE).types
+    return types[_HEADER](types["builtin_interfaces/msg/Time"](*divmod(time_ns, SECOND)), names.FRAME)
 
 
 def pack_configuration(run: int, settings: Mapping[str, Any]) -> bytes:
     """A dtsa_msgs/Configuration as CDR."""
     text = json.dumps(settings, sort_keys=True)
-    message = _store().types[CONFIGURATION](_header(names.TIME_ZERO_NS), run, str(settings["mode"]), text)
-    return bytes(_store().serialize_cdr(message, CONFIGURATION))
+    store = _store(CONFIGURATION)
+    message = store.types[CONFIGURATION](_header(names.TIME_ZERO_NS), run, str(settings["mode"]), text)
+    return bytes(store.serialize_cdr(message, CONFIGURATION))
 
 
 def pack_record(run: int, slot: int, time_ns: int, steps: int, outcome: int = UNKNOWN, **fields: Any) -> bytes:
@@ -65,7 +62,8 @@ def pack_record(run: int, slot: int, time_ns: int, steps: int, outcome: int = UN
     """
     arrays = {name: np.ascontiguousarray(values, _KINDS[name]).ravel() for name, values in fields.items()}
     head = {"header": _header(time_ns), "run": run, "slot": slot, "outcome": outcome, "steps": steps}
-    return bytes(_store().serialize_cdr(_store().types[TYPE](**head, **_NOTHING | arrays), TYPE))
+    store = _store(TYPE)
+    return bytes(store.serialize_cdr(store.types[TYPE](**head, **_NOTHING | arrays), TYPE))
 
 
 def frame_fields(frames: Mapping[int, bytes], received: NDArray[np.bool_] | None) -> dict[str, Any]:
@@ -102,9 +100,9 @@ def check_format(bag: Bag) -> None:
     :raises UnusableBag: if it does not.
     """
     if topic := bag.topics.get(SLOT_RECORD):
-        bag.register(topic)
+        recorded = bag.typestore(SLOT_RECORD).fielddefs
         for kind, found in ((TYPE, topic.type), (_HEADER, _HEADER)):
-            (_, ours), (_, theirs) = _store().fielddefs[kind], bag.typestore.fielddefs.get(found, ((), ()))
+            (_, ours), (_, theirs) = _store(TYPE).fielddefs[kind], recorded.get(found, ((), ()))
             if not dict(ours).items() <= dict(theirs).items():
                 raise UnusableBag(bag.given, f"{SLOT_RECORD} is {topic.type}, without fields of this version's {kind}")
         return

@@ -87,7 +87,7 @@ def rewritten(bag: Path, target: Path, change: Callable[[Any], dict[str, Any]]) 
             for name, value in change(record).items():
                 old = getattr(record, name)
                 setattr(record, name, np.ascontiguousarray(value, old.dtype) if isinstance(old, np.ndarray) else value)
-            data = bytes(source.typestore.serialize_cdr(record, TYPE))
+            data = bytes(source.typestore(SLOT_RECORD).serialize_cdr(record, TYPE))
             copy.write(channel, data, message.log_time_ns, message.publish_time_ns)
     return target
 

@@ -190,7 +190,7 @@ def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespa
                     raw = bytearray(getattr(record, name).tobytes())
                     raw[8 if name == "data" else 0] ^= 1
                     setattr(record, name, np.frombuffer(bytes(raw), getattr(record, name).dtype))
-                    data, changed = bytes(bag.typestore.serialize_cdr(record, message.type)), True
+                    data, changed = bytes(bag.typestore(SLOT_RECORD).serialize_cdr(record, message.type)), True
                 elif message.topic == "/cf2/odom" and name == "odom" and not changed:
                     data, changed = data[:60] + bytes([data[60] ^ 1]) + data[61:], True
                 copy.write(channels[message.topic], data, message.log_time_ns, message.publish_time_ns)
