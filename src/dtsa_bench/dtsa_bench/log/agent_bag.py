@@ -232,23 +232,6 @@ def recorded(out: str, agent: LiveAgent, port: PortSettings) -> Iterator[AgentRe
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------
-def find_bag(path: str | Path) -> Path:
-    """The file of what was given as an agent's bag.
-
-    :raises UnusableBag: if there is none, or several.
-    :raises NothingWritten: for a directory without one.
-    """
-    given = Path(path)
-    files = sorted(given.glob("*.mcap")) if given.is_dir() else [given] if given.is_file() else []
-    if len(files) == 1:
-        return files[0]
-    if not given.is_dir():
-        raise UnusableBag(given, "there is no such file or directory")
-    if not files:
-        raise NothingWritten(given, "holds no .mcap file")
-    raise UnusableBag(given, f"holds {len(files)} .mcap files; name one")
-
-
 def find_bags(path: str | Path) -> list[Path]:
     """The agents' bags of a flight in a directory: `cf1.mcap`, ... in it, or each in a directory of its own.
 
@@ -285,16 +268,19 @@ def read(path: str | Path) -> AgentBag:
     :raises UnusableBag: if it is no bag of an agent on a network, or its messages are not those that were recorded.
     :raises NothingWritten: if its process ended before it wrote anything.
     """
-    file = find_bag(path)
+    given = Path(path)
+    if given.is_dir() and not any(given.glob("*.mcap*")):
+        raise NothingWritten(given, "holds no .mcap file")
+    file = metadata.find_files(given)[0]
     try:
         if not file.stat().st_size:
             raise NothingWritten(file, "is empty")
         with ExitStack() as stack:
             try:
-                bag, damage = stack.enter_context(Bag(file)), ""
+                bag, damage = stack.enter_context(Bag(given)), ""
                 messages = list(bag.messages())
             except UnusableBag:
-                saved = recover(file, Path(stack.enter_context(TemporaryDirectory())) / file.name)
+                saved = recover(given, Path(stack.enter_context(TemporaryDirectory())) / file.name)
                 bag, damage = stack.enter_context(Bag(saved.directory)), saved.damaged[0] if saved.has_end else ""
                 messages = list(bag.messages())
             try:
