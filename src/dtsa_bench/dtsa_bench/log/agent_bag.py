@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.port import PortProperties, PortSettings, flight_ns
+from dtsa_agent.air.port import PortProperties, PortSettings
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
@@ -83,11 +83,6 @@ class AgentBag:
         return np.flatnonzero(self.log.known) + self.log.first_slot
 
     @property
-    def start_ns(self) -> NDArray[np.int64]:
-        """(R,) when these started."""
-        return self.log.start_ns[self.log.known[:, 0]]
-
-    @property
     def sent_ns(self) -> NDArray[np.int64]:
         """(F,) when each frame of the log was handed to the network."""
         row = self.log.sent_frames.row
@@ -99,11 +94,6 @@ class AgentBag:
         """What the agent heard."""
         assert self.log.heard is not None
         return self.log.heard
-
-    @property
-    def flight_ns(self) -> int:
-        """From the order to send a frame to its arrival as the agents take it to be, ns."""
-        return flight_ns(self.swarm, self.port)
 
 
 # -- writing ---------------------------------------------------------------------------------------------------------
@@ -313,8 +303,9 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
         swarm = SwarmConfig.from_dict(bag.config["swarm"])
         agent, started_ns = int(about["id"]), int(about["started_ns"])
         whole_ns = int(custom.get(BROKEN_OFF, 1 << 63))  # `recover` has made this file of one that was not finished
-        records = [bag.decode(message) for message in messages if message.log_time_ns <= whole_ns]
-        logs = [_log_of(part, file.stem, agent, swarm, about) for part in _times(records)]
+        whole = [one for one in messages if one.topic == SLOT_RECORD and one.log_time_ns <= whole_ns]
+        times = _times([bag.decode(message) for message in whole])
+        logs = [_log_of(records, file.stem, agent, swarm, about) for records in times]
         refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})
         return AgentBag(
             file, agent, swarm, PortProperties(**about["port"]), started_ns, logs[-1], logs[:-1], refused, summary,

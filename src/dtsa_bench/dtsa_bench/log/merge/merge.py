@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.port import frame_in
+from dtsa_agent.air.port import flight_ns, frame_in
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.agent_bag import AgentBag
 from dtsa_bench.log.arrays import DECIDED, UNKNOWN, VECTORS, FlightArrays, ReceivedFrames, empty_arrays, split_log
@@ -54,7 +54,7 @@ class Merge:
         self.config = bags[0].swarm
         self.sent = _sent_datagrams(self.processes)
         self.heard_count, self.unmatched, crossings = _crossings(self.processes, self.sent, not self.nothing_written)
-        self.line = fit(sorted(self.processes), crossings, bags[0].flight_ns)
+        self.line = fit(sorted(self.processes), crossings, flight_ns(self.config, bags[0].port))
         self.apart = _groups_apart(self.processes, self.line)
         self._starts = _SlotStarts(self.processes, self.line.clocks, self.config.slot_ns)
 
@@ -242,7 +242,7 @@ class _SlotStarts:
     def __init__(self, processes: Processes, clocks: Mapping[Process, Clock], slot_ns: int) -> None:
         self._slot_ns = slot_ns
         on_line = [(process, clocks[process], bag) for process, bag in processes.items() if process in clocks]
-        starts = [(bag.slots, clock.common_ns(bag.start_ns)) for _, clock, bag in on_line]
+        starts = [(bag.slots, clock.common_ns(bag.log.start_ns[bag.log.recorded])) for _, clock, bag in on_line]
         first = [int(clock.common_ns(bag.started_ns)) for process, clock, bag in on_line if process[1] == 0]
         self._started_ns = max(first, default=None)
         self._slot = np.unique(np.concatenate([np.zeros(0, np.int64), *(slots for slots, _ in starts)]))
@@ -293,13 +293,13 @@ def _log_alone(process: Process, bag: AgentBag) -> FlightLog:
 
 
 def _join(
-    processes: Processes, times: Mapping[Process, ToCommon], common_slot: int, flight_ns: int,
+    processes: Processes, times: Mapping[Process, ToCommon], common_slot: int, under_way_ns: int,
     about: Mapping[str, Any],
 ) -> FlightLog:  # fmt: skip
     """The log of a flight of which these are the agents' records.
 
     :param common_slot: the first slot that all counted alike, slot 0 of the log.
-    :param flight_ns: from the order to send a frame to its arrival.
+    :param under_way_ns: from the order to send a frame to its arrival.
     :param about: what to know of the bags, as plain values.
     :raises BagError: if most slots are missing.
     """
@@ -333,7 +333,7 @@ def _join(
     columns = taken.slot.tolist(), taken.sender.tolist(), taken.time_ns.tolist(), taken.data
     for slot, sender, arrival_ns, data in zip(*columns, strict=True):  # frames of agents of which there is no record
         if first <= slot <= last:
-            frames.setdefault((slot - first, sender), (arrival_ns - flight_ns, data))
+            frames.setdefault((slot - first, sender), (arrival_ns - under_way_ns, data))
     keys = sorted(frames)
     for row, sender in keys:
         at_ns, data = frames[row, sender]
