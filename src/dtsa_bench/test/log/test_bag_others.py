@@ -58,7 +58,7 @@ def check(run: SyntheticRun, path: Path, target: Path) -> None:
         with Bag(bag) as opened:
             assert opened.config == RunConfig(run.config).to_dict()
             assert {name: topic.count for name, topic in opened.topics.items()} == run.writer.counts
-            assert (opened.message_count, opened.start_ns) == (sum(run.writer.counts.values()), SECOND)
+            assert opened.start_ns == SECOND
         assert len(load_log(bag).outcome) == 39  # the last one is not answered
 
 

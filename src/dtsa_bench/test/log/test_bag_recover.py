@@ -13,6 +13,7 @@ import pytest
 from bag_helpers import SyntheticRun, synthetic_bag
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.writer import CompressionType
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
@@ -27,7 +28,7 @@ from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig
 
 Row = tuple[str, int, int, int, bytes]
-COMPRESSIONS = ("zstd", "lz4", "none")
+COMPRESSIONS = tuple(CompressionType)
 
 
 def rows_of(path: Path) -> list[Row]:
@@ -50,9 +51,9 @@ def chunks_of(path: Path) -> list[tuple[int, int, int]]:
     return found
 
 
-@pytest.fixture(scope="module", params=COMPRESSIONS)
+@pytest.fixture(scope="module", params=COMPRESSIONS, ids=lambda one: one.name)
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
-    directory = tmp_path_factory.mktemp(f"bags_{request.param}") / "flight"
+    directory = tmp_path_factory.mktemp("bags") / "flight"
     return synthetic_bag(directory, slots=30, agents=3, chunk_size=9000, compression=request.param)
 
 

@@ -6,6 +6,7 @@ import mmap
 import re
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from io import BytesIO
@@ -57,7 +58,7 @@ class BagFile:
         self.is_closed = self._data[-len(MAGIC) :] == MAGIC and len(self._data) > len(MAGIC)  # whether it has an end
         self.index_fault = ""  # why its index cannot be used; empty: it can
         self.summary = Summary()  # as its index has it; empty if there is none
-        self.counts: dict[int, int] = {}  # messages by channel, likewise
+        self.counts: Counter[str] = Counter()  # messages by topic, likewise
         self.about: dict[str, Any] = {}  # what the recorder says of the bag, likewise
         self.faults: list[str] = []  # where and why its records cannot be read
         self.whole_ns = 1 << 63  # log time of the last message before the first of them
@@ -66,6 +67,8 @@ class BagFile:
             self._read_index()
         except Exception as error:  # the library meets damaged files with many kinds of errors
             self.index_fault = str(error) or type(error).__name__
+        for number, count in self._channel_counts().items():
+            self.counts[self.summary.channels[number].topic if number in self.summary.channels else "?"] += count
 
     def _read_index(self) -> None:
         """Read what stands behind the messages; raises errors of any kind for a damaged file."""
@@ -77,8 +80,7 @@ class BagFile:
         summary = self.reader.get_summary()
         if summary is None or summary.statistics is None:
             raise McapError("it has no index")
-        self.summary, counts = summary, summary.statistics.channel_message_counts
-        self.counts = {number: count for number, count in counts.items() if count}
+        self.summary = summary
         with suppress(Exception):  # of a damaged record: whatever the library meets, there is none then
             for record in self.reader.iter_metadata():
                 if record.name == metadata.RECORD_NAME:
@@ -88,12 +90,16 @@ class BagFile:
             raise McapError("its messages are not in indexed chunks")
         self._complete_channels()
 
+    def _channel_counts(self) -> dict[int, int]:
+        statistics = self.summary.statistics
+        return {n: count for n, count in statistics.channel_message_counts.items() if count} if statistics else {}
+
     def _complete_channels(self) -> None:
         """Complete an index that repeats no channels or schemas by those that stand before the messages."""
-        channels, schemas = self.summary.channels, self.summary.schemas
+        channels, schemas, counts = self.summary.channels, self.summary.schemas, self._channel_counts()
 
         def is_complete() -> bool:
-            found = [channels.get(number) for number in self.counts]
+            found = [channels.get(number) for number in counts]
             return all(channel and channel.schema_id in (0, *schemas) for channel in found)
 
         if is_complete():
@@ -107,7 +113,7 @@ class BagFile:
                 continue
             if is_complete():
                 return
-        if not self.counts.keys() <= channels.keys():
+        if not counts.keys() <= channels.keys():
             raise McapError("the channels of some messages are not defined")
 
     def checksum_fault(self) -> str:

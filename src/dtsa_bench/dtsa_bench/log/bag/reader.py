@@ -51,7 +51,6 @@ class Bag:
         paths = metadata.find_files(self.given)
         self.path = paths[0]
         self.topics: dict[str, Topic] = {}
-        self.message_count = self.start_ns = self.end_ns = 0
         about = metadata.read_beside(self.path, self.given)
         with ExitStack() as stack:
             self._files = [BagFile(part, self.given, stack) for part in paths]
@@ -63,6 +62,9 @@ class Bag:
                 why = f"recorded as {topic.definition.encodings}, not as {READABLE}: not a ROS 2 bag"
                 raise UnusableBag(self.given, f"topic {topic.name} is {why}")
             self._stack = stack.pop_all()
+        statistics = [one for file in self._files if (one := file.summary.statistics) and one.message_count]
+        self.start_ns = min((one.message_start_time for one in statistics), default=0)
+        self.end_ns = max((one.message_end_time for one in statistics), default=0)
         self._has_packed_messages = metadata.has_packed_messages(about)
         self._typestores: dict[str, Typestore] = {}  # by topic
         #: The recorder's own texts; empty in a foreign bag.
@@ -73,18 +75,13 @@ class Bag:
         if file.index_fault:
             raise self._damaged(f"it was not closed, or is damaged ({file.index_fault})")
         summary = file.summary
-        for number, channel in sorted(summary.channels.items()):
+        for _, channel in sorted(summary.channels.items()):
             definition = Definition.of_channel(channel, summary.schemas.get(channel.schema_id))
             profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
             before = self.topics.get(channel.topic) or Topic(channel.topic, definition, profiles)
-            count = before.count + file.counts.get(number, 0)
-            self.topics[channel.topic] = Topic(channel.topic, definition, profiles or before.profiles, count)
-        statistics = summary.statistics
-        if statistics and statistics.message_count:
-            start_ns = statistics.message_start_time
-            self.start_ns = min(self.start_ns, start_ns) if self.message_count else start_ns
-            self.end_ns = max(self.end_ns, statistics.message_end_time)
-            self.message_count += statistics.message_count
+            self.topics[channel.topic] = Topic(channel.topic, definition, profiles or before.profiles, before.count)
+        for topic in self.topics.values():
+            topic.count += file.counts[topic.name]
 
     def _damaged(self, what: str) -> UnusableBag:
         return UnusableBag(self.given, f"{what}; `{program()} recover {self.given}` saves what can be read")

@@ -60,11 +60,11 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
         files = [BagFile(part, path, stack) for part in paths]
         profile, about = _begin(files, path)
         custom_data = {**metadata.custom_data(about), metadata.RECOVERED_FROM: result.source.name}
-        with BagWriter(result.directory, None, custom_data=custom_data, min_time_ns=0, profile=profile) as writer:
+        with BagWriter(result.directory, None, custom_data=custom_data, profile=profile) as writer:
             copy = _Copy(writer, metadata.has_packed_messages(about))
             for file in files:
                 copy.add(file)
-            result.saved, result.expected = writer.counts, dict(copy.expected)
+            result.saved, result.expected = writer.counts, dict(sum((file.counts for file in files), Counter()))
             result.start_ns, result.end_ns = writer.time_range_ns
             result.whole_ns = min(result.end_ns, *(file.whole_ns for file in files))
             expected = sum(result.expected.values())
@@ -110,42 +110,36 @@ class _Copy:
         self._writer, self._unpack = writer, metadata.unpack_message if packed else bytes
         self._topics: dict[str, tuple[int, Definition]] = {}  # channel of the new bag, what it is
         self.lost: Counter[str] = Counter()  # by why it is lost
-        self.expected: Counter[str] = Counter()  # messages by topic, as the files' own indexes say
 
     def add(self, file: BagFile) -> None:
         """Copy what can be read of one file."""
-        schemas, channels = dict(file.summary.schemas), dict(file.summary.channels)
-        targets: dict[int, int] = {}  # channels of the new bag by those of the file; 0: none
+        schemas = dict(file.summary.schemas)
+        # Channels of the new bag by those of the file; 0: none.
+        targets = {number: self._channel(channel, schemas) for number, channel in file.summary.channels.items()}
         for record in file.records():
             if isinstance(record, Message):
-                number = record.channel_id
-                if number not in targets:  # its channel stands where the file is damaged
-                    targets[number] = self._channel(channels.get(number), schemas)
                 try:
                     data = self._unpack(record.data)
                 except (ZstdError, MemoryError):
                     self.lost["messages cannot be unpacked"] += 1
                     continue
-                if targets[number]:
-                    self._writer.write(targets[number], data, record.log_time, record.publish_time, record.sequence)
+                if target := targets.get(record.channel_id, 0):
+                    self._writer.write(target, data, record.log_time, record.publish_time, record.sequence)
                 else:
                     self.lost["messages belong to topics that are not defined"] += 1
             elif isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
-                channels[record.id] = record
                 targets[record.id] = self._channel(record, schemas)
             elif isinstance(record, Metadata):
                 if record.name != metadata.RECORD_NAME:
                     self._writer.add_metadata(record.name, record.metadata)
                 elif KEY in (last := metadata.custom_data(metadata.load_record(record))):
                     self._writer.custom_data[f"recovered_{KEY}"] = last[KEY]  # the new bag gets one of its own
-        for number, count in file.counts.items():
-            self.expected[channels[number].topic if number in channels else "?"] += count
 
-    def _channel(self, channel: Channel | None, schemas: Mapping[int, Schema]) -> int:
+    def _channel(self, channel: Channel, schemas: Mapping[int, Schema]) -> int:
         """The new bag's channel for one of the file; 0: it is not defined, or its topic has another type already."""
-        if channel is None or (channel.schema_id and channel.schema_id not in schemas):
+        if channel.schema_id and channel.schema_id not in schemas:
             return 0
         definition = Definition.of_channel(channel, schemas.get(channel.schema_id))
         if channel.topic not in self._topics:

@@ -123,17 +123,14 @@ def installed(name: str) -> Definition:
 
 def brought(name: str, folder: Path) -> Definition:
     """Definition and RIHS01 hash of a type of messages where there is no ROS; `folder`: the project's own files."""
-    own = {f"dtsa_msgs/msg/{path.stem}": path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.msg"))}
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for kind, text in own.items():
-        store.register(get_types_from_msg(text, kind))
+    store, (package, _, short), own = get_typestore(Stores.ROS2_JAZZY), name.split("/"), ""
+    if package == "dtsa_msgs" and (file := folder / f"{short}.msg").is_file():
+        own = file.read_text(encoding="utf-8")
+        store.register(get_types_from_msg(own, name))
     if name not in store.fielddefs:
         raise BagError(f"message type {name}: not installed")
-
-    def text_of(kind: str) -> str:
-        return own[kind] if kind in own else store.generate_msgdef(kind, ros_version=2)[0].partition(SEPARATOR)[0]
-
-    return Definition(name, concatenate(name, text_of), store.hash_rihs01(name))
+    root, *needed = store.generate_msgdef(name, ros_version=2)[0].partition(SEPARATOR)
+    return Definition(name, "\n".join([own or root, "".join(needed)]), store.hash_rihs01(name))
 
 
 def _file(name: str, suffix: str) -> Path:

@@ -30,8 +30,6 @@ from . import metadata
 from .errors import BagError
 from .schema import Definition, Topic, installed
 
-COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
 FLUSH_S = 0.5
 BROKEN_OFF = "broken_off"  # key of custom_data of a bag of which a part is lost: log time up to which it is whole, ns
 KEY = "digest"  # name of the digest in custom_data
@@ -47,12 +45,11 @@ class BagWriter:
     :param directory: where the bag is made; empty, or not there yet. Or the name of an .mcap file, for a bag of
         this file alone.
     :param config: configuration of the run, JSON types; None: the bag says nothing of its origin but `custom_data`.
-    :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
+    :param compression: of the chunks of the .mcap.
     :param chunk_size: bytes, size at which a chunk is closed even if its half second is not over.
-    :param min_time_ns: ns, earliest log time that is accepted.
     :param marked: whether chunks end at a `mark` only; the recorder calls it after each step of the run.
     :param profile: MCAP's name for the conventions that topics and messages follow.
-    :raises ConfigError: if the directory is in use or the compression is unknown.
+    :raises ConfigError: if the directory is in use.
     :raises BagError: if the directory cannot be made or written to; likewise below, for a full disk or a closed bag.
     """
 
@@ -60,15 +57,12 @@ class BagWriter:
         self,
         directory: str | Path,
         config: Mapping[str, Any] | None,
-        compression: str = "zstd",
+        compression: CompressionType = CompressionType.ZSTD,
         chunk_size: int = 1 << 20,
         custom_data: Mapping[str, str] | None = None,
-        min_time_ns: int = MIN_TIME_NS,
         marked: bool = False,
         profile: str = "ros2",
     ) -> None:
-        if compression not in COMPRESSIONS:
-            raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
         self.directory = Path(directory)
         self._is_file = self.directory.suffix == ".mcap"
         if not self._is_file:
@@ -79,9 +73,7 @@ class BagWriter:
                 "project": "dtsa", "version": __version__, "configuration": json.dumps(config, sort_keys=True),
                 "seed": str({**config, **config.get("swarm", {})}.get("seed", "")),
             }  # fmt: skip
-        if marked:
-            self.custom_data["chunks"] = "complete steps"
-        self._marked, self._chunk_size, self._min_time_ns = marked, chunk_size, min_time_ns
+        self._marked, self._chunk_size = marked, chunk_size
         self._chunk_bytes = 0  # in the chunk that is being filled
         self.path = self.directory if self._is_file else self.directory / f"{self.directory.resolve().name}_0.mcap"
         self._topics: list[Topic] = []  # the channel's number - 1 is its index
@@ -96,7 +88,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         self._mcap = Writer(
-            self._stream, chunk_size=_UNLIMITED if marked else chunk_size, compression=COMPRESSIONS[compression],
+            self._stream, chunk_size=_UNLIMITED if marked else chunk_size, compression=compression,
             enable_data_crcs=True,
         )  # fmt: skip
         with self._failing():
@@ -145,13 +137,11 @@ class BagWriter:
         """Record one message.
 
         :param data: the message as CDR, with its encapsulation header.
-        :param log_time_ns: ns, simulated time of reception, 1 s or later.
+        :param log_time_ns: ns, simulated time of reception.
         :param publish_time_ns: ns, simulated time of transmission.
         :param sequence: number of the message on its topic; None: the next one.
         """
         self._check_open()
-        if log_time_ns < self._min_time_ns:
-            raise BagError(f"message at {log_time_ns} ns: times of a bag start at {self._min_time_ns} ns")
         if not 0 < channel <= len(self._topics):
             raise BagError(f"channel {channel} was never added to {self.directory}")
         topic = self._topics[channel - 1]
