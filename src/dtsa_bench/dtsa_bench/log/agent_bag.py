@@ -294,8 +294,9 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
         raise UnusableBag(file, f"no bag of an agent on a network, as `{program()} agent --out` makes them")
     if messages:
         check_format(bag)
-    for one in messages:
-        digest.add(one.topic, one.type, one.log_time_ns, one.publish_time_ns, one.sequence, one.data)
+    for message in messages:
+        times = message.log_time_ns, message.publish_time_ns, message.sequence
+        digest.add(message.topic, message.type, *times, message.data)
     if custom.get(KEY, digest.hexdigest()) != digest.hexdigest():
         raise UnusableBag(file, "a message was changed, left out, added or moved after the recording")
     try:
@@ -303,9 +304,12 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
         swarm = SwarmConfig.from_dict(bag.config["swarm"])
         agent, started_ns = int(about["id"]), int(about["started_ns"])
         whole_ns = int(custom.get(BROKEN_OFF, 1 << 63))  # `recover` has made this file of one that was not finished
-        whole = [one for one in messages if one.topic == SLOT_RECORD and one.log_time_ns <= whole_ns]
-        times = _times([bag.decode(message) for message in whole])
-        logs = [_log_of(records, file.stem, agent, swarm, about) for records in times]
+        records = [
+            bag.decode(message)
+            for message in messages
+            if message.topic == SLOT_RECORD and message.log_time_ns <= whole_ns
+        ]
+        logs = [_log_of(part, file.stem, agent, swarm, about) for part in _split_times(records)]
         refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})
         return AgentBag(
             file, agent, swarm, PortProperties(**about["port"]), started_ns, logs[-1], logs[:-1], refused, summary,
@@ -315,7 +319,7 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
         raise UnusableBag(file, f"what it says of its agent cannot be read ({error})") from None
 
 
-def _times(records: Sequence[Any]) -> list[list[Any]]:
+def _split_times(records: Sequence[Any]) -> list[list[Any]]:
     """The records of each time that an agent has taken over, the last one perhaps without any."""
     times: list[list[Any]] = [[]]
     for record in records:
