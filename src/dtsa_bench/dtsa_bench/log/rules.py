@@ -27,7 +27,7 @@ PLAIN = "plain"
 
 
 @dataclass(slots=True)
-class GivenTurn:
+class GrantedTurn:
     """A turn that was given away, and the agents that it was given to."""
 
     given: list[tuple[int, int]] = field(default_factory=list)  # issuer, lessee
@@ -51,7 +51,7 @@ class GrantLedger:
     agents: int
     anchor_every: int
     main_every: int = 0
-    turns: dict[int, GivenTurn] = field(default_factory=dict)
+    turns: dict[int, GrantedTurn] = field(default_factory=dict)
     quiet: dict[int, int] = field(default_factory=dict)  # last slot in which each was in probation
     collisions: Counter[str] = field(default_factory=Counter)  # slots with two senders, by a key of COLLISIONS or PLAIN
     leased_slots: int = 0
@@ -84,7 +84,7 @@ class GrantLedger:
 
     def check_slot(self, slot: int, frames: dict[int, bytes]) -> None:
         """Takes in one slot."""
-        turn, owner = self.turns.pop(slot, GivenTurn()), slot % self.agents + 1
+        turn, owner = self.turns.pop(slot, GrantedTurn()), slot % self.agents + 1
         is_open = any(lessee == OPEN for _, lessee in turn.given)
         adopted = any(issuer != owner for issuer, _ in turn.given)
         self.leased_slots += bool(turn.given) and not is_open and not adopted
@@ -108,11 +108,11 @@ class GrantLedger:
             return False
         return decode_extended(data).probation
 
-    def _has_forgotten(self, turn: GivenTurn, sender: int) -> bool:
+    def _has_forgotten(self, turn: GrantedTurn, sender: int) -> bool:
         """Whether a sender handed the turn on before it restarted: what others relay may be all that it knows."""
         return self.quiet.get(sender, -1) > turn.handed_on.get(sender, self._NEVER)
 
-    def _check_sender(self, slot: int, sender: int, data: bytes, turn: GivenTurn) -> None:
+    def _check_sender(self, slot: int, sender: int, data: bytes, turn: GrantedTurn) -> None:
         last, owner = turn.holders, slot % self.agents + 1
         if sender in last or OPEN in last or self._has_forgotten(turn, sender):
             return
@@ -140,7 +140,7 @@ class GrantLedger:
                 continue
             if self._is_main(number) or number <= slot:
                 self.broken.append(f"slot {slot}: agent {sender} gives away turn {number}")
-            turn = self.turns.setdefault(number, GivenTurn())
+            turn = self.turns.setdefault(number, GrantedTurn())
             is_again = any(issuer == sender for issuer, _ in turn.given)
             if is_again and lessee in turn.named:
                 continue

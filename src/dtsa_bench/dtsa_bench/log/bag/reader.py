@@ -23,7 +23,7 @@ from dtsa_bench.runs.program import program
 from . import metadata
 from .errors import BagError, UnusableBag
 from .file import BagFile
-from .schema import READABLE, Definition, Topic, typestore_of
+from .schema import READABLE, Topic, typestore_of
 
 NOT_OF_ITS_TYPE = (SerdeError, AssertionError, IndexError, KeyError, ValueError, struct.error)  # of rosbags
 
@@ -76,10 +76,10 @@ class Bag:
             raise self._damaged(f"it was not closed, or is damaged ({file.index_fault})")
         summary = file.summary
         for _, channel in sorted(summary.channels.items()):
-            definition = Definition.of_channel(channel, summary.schemas.get(channel.schema_id))
-            profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
-            before = self.topics.get(channel.topic) or Topic(channel.topic, definition, profiles)
-            self.topics[channel.topic] = Topic(channel.topic, definition, profiles or before.profiles, before.count)
+            topic = Topic.of_channel(channel, summary.schemas.get(channel.schema_id))
+            if before := self.topics.get(topic.name):
+                topic.profiles, topic.count = topic.profiles or before.profiles, before.count
+            self.topics[topic.name] = topic
         for topic in self.topics.values():
             topic.count += file.counts[topic.name]
 

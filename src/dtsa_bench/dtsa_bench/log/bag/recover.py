@@ -20,7 +20,7 @@ from zstandard import ZstdError
 from . import metadata
 from .errors import NothingWritten, UnusableBag
 from .file import BagFile
-from .schema import Definition
+from .schema import Topic
 from .writer import BROKEN_OFF, KEY, BagWriter
 
 
@@ -108,7 +108,7 @@ class _Copy:
 
     def __init__(self, writer: BagWriter, packed: bool) -> None:
         self._writer, self._unpack = writer, metadata.unpack_message if packed else bytes
-        self._topics: dict[str, tuple[int, Definition]] = {}  # channel of the new bag, what it is
+        self._topics: dict[str, tuple[int, Topic]] = {}  # channel of the new bag, by name
         self.lost: Counter[str] = Counter()  # by why it is lost
 
     def add(self, file: BagFile) -> None:
@@ -141,11 +141,10 @@ class _Copy:
         """The new bag's channel for one of the file; 0: it is not defined, or its topic has another type already."""
         if channel.schema_id and channel.schema_id not in schemas:
             return 0
-        definition = Definition.of_channel(channel, schemas.get(channel.schema_id))
-        if channel.topic not in self._topics:
-            profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
-            number = self._writer.add_topic(channel.topic, definition.name, profiles, definition)
-            self._topics[channel.topic] = number, definition
-        number, first = self._topics[channel.topic]
-        kind = (definition.name, definition.encoding, definition.message_encoding)
-        return number if kind == (first.name, first.encoding, first.message_encoding) else 0
+        topic = Topic.of_channel(channel, schemas.get(channel.schema_id))
+        if topic.name not in self._topics:
+            number = self._writer.add_topic(topic.name, topic.type, topic.profiles, topic.definition)
+            self._topics[topic.name] = number, topic
+        number, first = self._topics[topic.name]
+        is_alike = (topic.type, topic.definition.encodings) == (first.type, first.definition.encodings)
+        return number if is_alike else 0

@@ -45,14 +45,6 @@ class Definition:
         """Of messages and definition; READABLE alone can be decoded."""
         return f"{self.message_encoding}/{self.encoding or 'no schema'}"
 
-    @classmethod
-    def of_channel(cls, channel: Channel, schema: Schema | None) -> Definition:
-        """What a file says of the type of a channel's messages."""
-        type_hash, encoding = channel.metadata.get("topic_type_hash", ""), channel.message_encoding
-        if schema is None:
-            return cls("", "", type_hash, "", encoding)
-        return cls(schema.name, schema.data.decode("utf-8", "surrogateescape"), type_hash, schema.encoding, encoding)
-
 
 @dataclass(slots=True)
 class Topic:
@@ -67,6 +59,15 @@ class Topic:
     def type(self) -> str:
         """ "package/msg/Type"."""
         return self.definition.name
+
+    @classmethod
+    def of_channel(cls, channel: Channel, schema: Schema | None) -> Topic:
+        """What a file says of a channel."""
+        text = "" if schema is None else schema.data.decode("utf-8", "surrogateescape")
+        name, encoding = ("", "") if schema is None else (schema.name, schema.encoding)
+        type_hash = channel.metadata.get("topic_type_hash", "")
+        definition = Definition(name, text, type_hash, encoding, channel.message_encoding)
+        return cls(channel.topic, definition, metadata.load_profiles(channel.metadata.get("offered_qos_profiles", "")))
 
 
 @lru_cache(maxsize=128)  # compiling a type takes longer than reading most bags
@@ -116,9 +117,9 @@ def installed(name: str) -> Definition:
         raise BagError(f"message type {name!r}: not of the form package/msg/Type")
     if importlib.util.find_spec("ament_index_python") is None and _BROUGHT.is_dir():
         return brought(name, _BROUGHT)
-    hashes = json.loads(_file(name, ".json").read_text(encoding="utf-8"))["type_hashes"]
+    hashes = json.loads(_text(name, ".json"))["type_hashes"]
     type_hash = next(entry["hash_string"] for entry in hashes if entry["type_name"] == name)
-    return Definition(name, concatenate(name, lambda kind: _file(kind, ".msg").read_text(encoding="utf-8")), type_hash)
+    return Definition(name, concatenate(name, lambda kind: _text(kind, ".msg")), type_hash)
 
 
 def brought(name: str, folder: Path) -> Definition:
@@ -133,16 +134,15 @@ def brought(name: str, folder: Path) -> Definition:
     return Definition(name, "\n".join([own or root, "".join(needed)]), store.hash_rihs01(name))
 
 
-def _file(name: str, suffix: str) -> Path:
+def _text(name: str, suffix: str) -> str:
+    """An installed file of a type of messages."""
     from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
     package, _, short = name.split("/")
     try:
-        path = Path(get_package_share_directory(package)) / "msg" / f"{short}{suffix}"
+        folder = Path(get_package_share_directory(package)) / "msg"
+        return (folder / f"{short}{suffix}").read_text(encoding="utf-8")
     except PackageNotFoundError:
         raise BagError(f"message type {name}: package {package} is not installed") from None
     except OSError as error:
         raise BagError(f"message type {name}: {error}") from None
-    if not path.is_file():
-        raise BagError(f"message type {name}: {path} is missing")
-    return path

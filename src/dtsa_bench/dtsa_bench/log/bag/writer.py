@@ -33,7 +33,7 @@ from .schema import Definition, Topic, installed
 FLUSH_S = 0.5
 BROKEN_OFF = "broken_off"  # key of custom_data of a bag of which a part is lost: log time up to which it is whole, ns
 KEY = "digest"  # name of the digest in custom_data
-_UNLIMITED = 1 << 62  # bytes: chunks end at marks
+_UNLIMITED = 1 << 62  # bytes: chunks end where `mark` ends them
 _RECORD_BYTES = 31  # bytes of a message record beside its data
 _TIMES = struct.Struct("<QQQ")
 _MASK = (1 << 128) - 1
@@ -88,7 +88,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         self._mcap = Writer(
-            self._stream, chunk_size=_UNLIMITED if marked else chunk_size, compression=compression,
+            self._stream, chunk_size=_UNLIMITED, compression=compression,
             enable_data_crcs=True,
         )  # fmt: skip
         with self._failing():
@@ -155,10 +155,9 @@ class BagWriter:
         self._digest.add(topic.name, topic.type, log_time_ns, publish_time_ns, sequence, data)
         topic.count += 1
         self._start_ns, self._end_ns = min(self._start_ns, log_time_ns), max(self._end_ns, log_time_ns)
-        if self._marked:
-            self._chunk_bytes += len(data) + _RECORD_BYTES
-        elif monotonic() >= self._next_flush:
-            self.flush()
+        self._chunk_bytes += len(data) + _RECORD_BYTES
+        if not self._marked:
+            self.mark()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Store a metadata record of another name than rosbag2's."""
@@ -168,7 +167,7 @@ class BagWriter:
 
     def mark(self) -> None:
         """What has been written until now is a run up to a complete step: a chunk may end here."""
-        if self._marked and (monotonic() >= self._next_flush or self._chunk_bytes > self._chunk_size):
+        if monotonic() >= self._next_flush or self._chunk_bytes > self._chunk_size:
             self.flush()
 
     def flush(self) -> None:
