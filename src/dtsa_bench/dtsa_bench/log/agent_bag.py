@@ -303,12 +303,9 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
         about, summary = json.loads(custom[AGENT]), json.loads(custom.get(SUMMARY, "{}"))
         swarm = SwarmConfig.from_dict(bag.config["swarm"])
         agent, started_ns = int(about["id"]), int(about["started_ns"])
-        whole_ns = int(custom.get(BROKEN_OFF, 1 << 63))  # `recover` has made this file of one that was not finished
-        records = [
-            bag.decode(message)
-            for message in messages
-            if message.topic == SLOT_RECORD and message.log_time_ns <= whole_ns
-        ]
+        # As they were recorded: the clock of a vehicle that was switched off starts anew. Up to the first that is lost.
+        own = sorted((one for one in messages if one.topic == SLOT_RECORD), key=lambda message: message.sequence)
+        records = [bag.decode(message) for number, message in enumerate(own) if message.sequence == number]
         logs = [_log_of(part, file.stem, agent, swarm, about) for part in _split_times(records)]
         refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})
         return AgentBag(
