@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bag_helpers import SyntheticRun, synthetic_bag
+from bag_helpers import SyntheticRun, definition, synthetic_bag
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
@@ -198,6 +198,19 @@ def test_a_whole_bag_is_copied_what_is_missing_is_counted_and_what_is_there_stay
     with pytest.raises(ConfigError, match="empty or does not exist"):
         recover(run.writer.directory, run.writer.directory)
     assert {path.name for path in tmp_path.iterdir()} == {"note", "new", "bad.mcap", "less"}
+
+
+def test_a_topic_of_which_nothing_is_left_is_named(tmp_path: Path) -> None:
+    with writer.BagWriter(tmp_path / "bag.mcap", None, chunk_size=1) as bag:  # a chunk a message
+        for time_ns, topic in enumerate(("/a", "/b"), 1):
+            channel = bag.add_topic(topic, "nav_msgs/msg/Odometry", "reliable", definition("nav_msgs/msg/Odometry"))
+            bag.write(channel, b"\0\1\0\0", time_ns, time_ns)
+    (_, end, _), _ = chunks_of(tmp_path / "bag.mcap")
+    data = bytearray((tmp_path / "bag.mcap").read_bytes())
+    data[end - 1] ^= 1
+    (tmp_path / "bag.mcap").write_bytes(data)
+    result = recover(tmp_path / "bag.mcap")
+    assert (result.saved, result.expected) == ({"/a": 0, "/b": 1}, {"/a": 1, "/b": 1})
 
 
 CUTS = 40

@@ -52,10 +52,9 @@ class BagFile:
         self._stream = stack.enter_context(_open(path))
         if self._stream.read(len(MAGIC)) != MAGIC:
             raise UnusableBag(given, f"{path.name} is not an MCAP file, or its beginning is lost")
-        self._data = stack.enter_context(mmap.mmap(self._stream.fileno(), 0, access=mmap.ACCESS_READ))
         self._stream.seek(0)
         self.reader = SeekingReader(self._stream, validate_crcs=True)
-        self.is_closed = self._data[-len(MAGIC) :] == MAGIC and len(self._data) > len(MAGIC)  # whether it has an end
+        self.is_closed = False  # whether it has an end
         self.index_fault = ""  # why its index cannot be used; empty: it can
         self.summary = Summary()  # as its index has it; empty if there is none
         self.counts: Counter[str] = Counter()  # messages by topic, likewise
@@ -72,10 +71,13 @@ class BagFile:
 
     def _read_index(self) -> None:
         """Read what stands behind the messages; raises errors of any kind for a damaged file."""
+        self._stream.seek(-len(MAGIC), 2)
+        self.is_closed = self._stream.tell() > 0 and self._stream.read() == MAGIC
         if not self.is_closed:
             raise McapError("no end mark")
-        start, _, checksum, _ = _END.unpack(self._data[-_END.size :])
-        if start and checksum and zlib.crc32(self._data[start:-12]) != checksum:  # it covers all that stands before it
+        start, checksum = self._read_end()
+        self._stream.seek(start)
+        if start and checksum and zlib.crc32(self._stream.read()[:-12]) != checksum:  # of all that stands before it
             raise McapError("its index does not fit its checksum")
         summary = self.reader.get_summary()
         if summary is None or summary.statistics is None:
@@ -89,6 +91,12 @@ class BagFile:
         if summary.statistics.message_count and not summary.chunk_indexes:
             raise McapError("its messages are not in indexed chunks")
         self._complete_channels()
+
+    def _read_end(self) -> tuple[int, int]:
+        """Where the index begins, and its checksum."""
+        self._stream.seek(-_END.size, 2)
+        start, _, checksum, _ = _END.unpack(self._stream.read())
+        return start, checksum
 
     def _channel_counts(self) -> dict[int, int]:
         statistics = self.summary.statistics
@@ -121,7 +129,7 @@ class BagFile:
         if self.index_fault:
             return f"it is damaged ({self.index_fault})"
         try:
-            index_start, *_ = _END.unpack(self._data[-_END.size :])
+            index_start, _ = self._read_end()
             self._stream.seek(0)
             records = StreamReader(self._stream, emit_chunks=True, validate_crcs=True).records
             if not any(isinstance(record, DataEnd) for record in records) or self._stream.tell() != index_start:
@@ -135,42 +143,43 @@ class BagFile:
     def records(self) -> Iterator[Any]:
         """The records that can be read, in their order; a chunk's stand in its place."""
         self.faults, self.whole_ns = [], 1 << 63
-        position, size, last_ns = len(MAGIC), len(self._data), 0
-        chunked = self._next_chunk(position) < size
-        while position < size:
-            try:
-                begin = position + PREFIX.size
-                opcode, length = PREFIX.unpack(self._data[position:begin].ljust(PREFIX.size, b"\xff"))
-                if length > size - begin:
-                    raise ValueError("it is cut off")
-                if opcode == Opcode.DATA_END and length == 4:
-                    return
-                if opcode == Opcode.MESSAGE and chunked:  # it has no checksum: as likely a damaged index
-                    raise ValueError("a message outside of chunks")
-                records = _parsed(opcode, self._data[begin : begin + length])
-            except Exception as error:  # the library meets damage with many kinds of errors
-                goes_on = self._next_chunk(position + 1)
-                time = f", after {last_ns / 1e9:.3f} s," if last_ns else ""
-                self.faults.append(f"bytes {position} to {goes_on}{time} cannot be read ({error}) and are left out")
-                self.whole_ns, position = min(self.whole_ns, last_ns), goes_on
-                continue
-            yield from records
-            last_ns = max((record.log_time for record in records if isinstance(record, Message)), default=last_ns)
-            position = begin + length
+        with mmap.mmap(self._stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            position, size, last_ns = len(MAGIC), len(data), 0
+            chunked = self._next_chunk(data, position) < size
+            while position < size:
+                try:
+                    begin = position + PREFIX.size
+                    opcode, length = PREFIX.unpack(data[position:begin].ljust(PREFIX.size, b"\xff"))
+                    if length > size - begin:
+                        raise ValueError("it is cut off")
+                    if opcode == Opcode.DATA_END and length == 4:
+                        return
+                    if opcode == Opcode.MESSAGE and chunked:  # it has no checksum: as likely a damaged index
+                        raise ValueError("a message outside of chunks")
+                    records = _parsed(opcode, data[begin : begin + length])
+                except Exception as error:  # the library meets damage with many kinds of errors
+                    goes_on = self._next_chunk(data, position + 1)
+                    time = f", after {last_ns / 1e9:.3f} s," if last_ns else ""
+                    self.faults.append(f"bytes {position} to {goes_on}{time} cannot be read ({error}) and are left out")
+                    self.whole_ns, position = min(self.whole_ns, last_ns), goes_on
+                    continue
+                yield from records
+                last_ns = max((record.log_time for record in records if isinstance(record, Message)), default=last_ns)
+                position = begin + length
 
-    def _next_chunk(self, position: int) -> int:
+    def _next_chunk(self, data: mmap.mmap, position: int) -> int:
         """Where the next whole chunk begins; the end of the file if there is none."""
-        while match := _CHUNK.search(self._data, position):
+        while match := _CHUNK.search(data, position):
             position, end = match.start(), match.start() + PREFIX.size + int.from_bytes(match[1], "little")
-            if match.end() + int.from_bytes(match[2], "little") == end <= len(self._data):
+            if match.end() + int.from_bytes(match[2], "little") == end <= len(data):
                 self._tried += end - position
-                if self._tried > MOST_TRIED * len(self._data):  # made so: chance has no such chunks within chunks
+                if self._tried > MOST_TRIED * len(data):  # made so: chance has no such chunks within chunks
                     break
                 with suppress(Exception):  # whatever the library meets: then it is none
-                    _parsed(Opcode.CHUNK, self._data[position + PREFIX.size : end])
+                    _parsed(Opcode.CHUNK, data[position + PREFIX.size : end])
                     return position
             position += 1
-        return len(self._data)
+        return len(data)
 
 
 def _open(path: Path) -> IO[bytes]:
