@@ -61,7 +61,6 @@ class BagFile:
         self.about: dict[str, Any] = {}  # what the recorder says of the bag, likewise
         self.faults: list[str] = []  # where and why its records cannot be read
         self.whole_ns = 1 << 63  # log time of the last message before the first of them
-        self.is_finished = False  # whether reading has come to the end of the messages
         self._tried = 0  # bytes of what looked like chunks
         try:
             self._read_index()
@@ -154,7 +153,6 @@ class BagFile:
                     if length > size - begin:
                         raise ValueError("it is cut off")
                     if opcode == Opcode.DATA_END and length == 4:
-                        self.is_finished = True
                         return
                     if opcode == Opcode.MESSAGE and chunked:  # it has no checksum: as likely a damaged index
                         raise ValueError("a message outside of chunks")

@@ -18,7 +18,7 @@ from mcap.records import Channel, Header, Message, Metadata, Schema
 from zstandard import ZstdError
 
 from . import metadata
-from .errors import UnusableBag
+from .errors import NothingWritten, UnusableBag
 from .file import BagFile
 from .schema import Topic
 from .writer import BROKEN_OFF, KEY, BagWriter
@@ -37,6 +37,7 @@ class Recovery:
     whole_ns: int = 0  # log time up to which nothing is missing
     damaged: list[str] = field(default_factory=list)  # what is wrong, in words
     closed: bool = False  # whether the recorder finished the old file, and all of it could be read
+    has_end: bool = False  # whether the recorder finished the old file: what is damaged in it was damaged later
 
     @property
     def count(self) -> int:
@@ -67,6 +68,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
             result.start_ns, result.end_ns = writer.time_range_ns
             result.whole_ns = min(result.end_ns, *(file.whole_ns for file in files))
             expected = sum(result.expected.values())
+            result.has_end = all(file.is_closed for file in files)
             result.closed = 0 < expected <= result.count and all(file.counts for file in files)
             if not result.closed:
                 writer.custom_data[BROKEN_OFF] = str(result.whole_ns)
@@ -83,7 +85,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
 def _begin(files: list[BagFile], given: str | Path) -> tuple[str, dict[str, Any]]:
     """MCAP's profile, and what the recorder says of the bag before its first message.
 
-    :raises UnusableBag: if there is no message that can be read.
+    :raises UnusableBag: if there is no message that can be read; NothingWritten: and there was none yet.
     """
     profile, about = "", metadata.read_beside(files[0].path, given)
     for file in files:
@@ -97,7 +99,8 @@ def _begin(files: list[BagFile], given: str | Path) -> tuple[str, dict[str, Any]
                 channels.add(record.id)
             elif isinstance(record, Message) and record.channel_id in channels:
                 return profile, about
-    raise UnusableBag(given, "no message in it can be read: there is nothing to save")
+    is_begun = metadata.custom_data(about) and not any(file.is_closed for file in files)
+    raise (NothingWritten if is_begun else UnusableBag)(given, "no message in it can be read: there is nothing to save")
 
 
 class _Copy:
