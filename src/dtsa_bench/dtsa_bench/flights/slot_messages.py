@@ -18,6 +18,7 @@ from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 _ACCOUNT = ("chosen", "reason", "digest", "score", "track", "velocity", "command", "goal")
 _VIEW_NS = 50_000_000  # simulated time from one picture of the swarm to the next
 
+
 class SlotMessages:
     """Packs a slot as CDR: what agents decided, where they were, who received what."""
 
