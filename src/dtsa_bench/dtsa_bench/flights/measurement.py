@@ -72,8 +72,8 @@ class FlightMeasurement(ChannelObserver):
         """Why the flight is over; empty: it goes on."""
         return str(self.metrics.end or "")
 
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        self._outcome = verdict.outcome
+    def arbitrated(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        self._outcome, frames = verdict.outcome, answers.frames
         self._compared = answers.digest.copy(), answers.chosen.copy()
         self._lengths = [len(frames[sender]) for sender in verdict.senders]
         self.scenario.advance(slot, self.tables)  # what all know about each other's goals

@@ -13,7 +13,7 @@ from dtsa_bench.log.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPack
 from dtsa_bench.log.record import frame_fields, pack_record
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
 from dtsa_channel_sim.ros.answers import Answers
-from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+from dtsa_channel_sim.ros.observer import ChannelObserver
 
 _ACCOUNT = ("chosen", "reason", "digest", "score", "track", "velocity", "command", "goal")
 _VIEW_NS = 50_000_000  # simulated time from one picture of the swarm to the next
@@ -73,5 +73,5 @@ class LiveTopics(ChannelObserver):
             if watched and slot % slots == 0:
                 publisher.publish(pack(slot, answers, verdict))
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         self._watched = [publisher.get_subscription_count() > 0 for publisher, _, _ in self._topics]

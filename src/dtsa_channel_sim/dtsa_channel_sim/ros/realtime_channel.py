@@ -317,8 +317,6 @@ class RealtimeChannel(RosChannel):
         check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
         if not self.air.hand_over((slot, agent), start_ns, frame):
             return
-        if slot > self.slot:
-            self.accounts[slot].frames[agent] = frame
         self._observers.frame_sent(slot, agent, frame, start_ns)
         self._hear((agent,), now)
 
@@ -380,10 +378,10 @@ class RealtimeChannel(RosChannel):
             return False
         self.answers = book
         resolved = self._resolved.pop(slot, [])
-        frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in resolved}
+        book.frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in resolved}
         verdict = Verdict.of([verdict.sender for verdict in resolved], resolved)
         book.receipts = self.accounts.receipts(slot)
-        self._observers.arbitrated(slot, book, frames, verdict)
+        self._observers.arbitrated(slot, book, verdict)
         self._publish_clock(names.slot_time_ns(slot, self.slot_ns))
         self._observers.slot_over(slot, book, verdict)
         self.slot = slot

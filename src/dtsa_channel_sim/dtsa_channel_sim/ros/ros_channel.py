@@ -26,7 +26,7 @@ from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
 
 from .answers import Answers
-from .observer import ChannelObserver, ChannelStatus, Observers
+from .observer import ChannelObserver, Observers
 from .roster import Roster
 
 REPEAT_S = 0.1
@@ -96,8 +96,7 @@ class RosChannel:
 
     def observe(self, *observers: ChannelObserver) -> None:
         """Add observers; they are called in this order, after those that are there already."""
-        for observer in observers:
-            self._observers.add(observer)
+        self._observers.add(*observers)
 
     def change_settings(self, change: Change) -> None:
         """Tell the observers of a change of the medium's settings."""
@@ -261,7 +260,7 @@ class RosChannel:
             self._clock_watched = self._clock.get_subscription_count() > 0
             self._meet_processes()
             awaited = self.answers.silent if self.roster.closed else self.roster.missing
-            self._observers.idle(ChannelStatus(self.slot, awaited))
+            self._observers.idle(self.slot, awaited)
 
     def _goes_on(self, slot: int, answers: Answers) -> bool:
         """All agents have answered a slot; return whether the run goes on."""

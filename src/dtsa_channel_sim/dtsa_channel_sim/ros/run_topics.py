@@ -20,7 +20,7 @@ from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Answers
-from .observer import ChannelObserver, ChannelStatus
+from .observer import ChannelObserver
 from .ros_channel import RosChannel
 
 _STATUS_S = 1.0  # wall time from one status to the next while nothing changes
@@ -98,9 +98,9 @@ class RunTopics(ChannelObserver):
         self._state.regain(agents)
         self._publish()
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         before = list(self._state.message.awaited)
-        self._state.reach(status.slot, awaited=status.awaited)
+        self._state.reach(slot, awaited=awaited)
         if before != list(self._state.message.awaited) or time.monotonic() >= self._next_s:
             self._publish()
 
@@ -117,19 +117,19 @@ class Diagnostics(ChannelObserver):
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._ticks = 0
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         self._ticks += 1
         if self._ticks % 10 or not self._publisher.get_subscription_count():
             return
         dropped = self._channel.dropped()
-        values = {"agents awaited": status.awaited, "not taken in": sum(dropped.values())}
+        values = {"agents awaited": awaited, "not taken in": sum(dropped.values())}
         values |= {f"not taken in: {reason}": count for reason, count in sorted(dropped.items())}
         message = DiagnosticStatus(
             level=DiagnosticStatus.WARN if dropped else DiagnosticStatus.OK,
-            name=self._name, message=f"slot {status.slot}", hardware_id="simulated",
+            name=self._name, message=f"slot {slot}", hardware_id="simulated",
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )  # fmt: skip
-        header = header_of(names.slot_time_ns(max(0, status.slot), self._channel.slot_ns))
+        header = header_of(names.slot_time_ns(max(0, slot), self._channel.slot_ns))
         self._publisher.publish(DiagnosticArray(header=header, status=[message]))
 
 
@@ -160,7 +160,7 @@ class Transforms(ChannelObserver):
             translation.x, translation.y, translation.z = place
         self._publisher.publish(self._kind(transforms=self._transforms))
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         self._watched = self._publisher.get_subscription_count() > 0
 
 
@@ -180,15 +180,15 @@ class RunLog(ChannelObserver):
             self._flying = True
             self._logger.info("slot 0: all agents have answered, the run starts")
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         if not self._flying:
-            if status.awaited:
-                self._waiting.log(f"waiting for {agent_names(status.awaited)} to answer")
-        elif status.slot != self._slot or not status.awaited:
-            self._slot, self._since_s = status.slot, time.monotonic()
+            if awaited:
+                self._waiting.log(f"waiting for {agent_names(awaited)} to answer")
+        elif slot != self._slot or not awaited:
+            self._slot, self._since_s = slot, time.monotonic()
         elif self._lockstep and time.monotonic() - self._since_s > _SLOW_S:
             self._since_s = float("inf")
-            self._logger.warning(f"slot {status.slot}: still waiting for {agent_names(status.awaited)}")
+            self._logger.warning(f"slot {slot}: still waiting for {agent_names(awaited)}")
 
     def agent_silent(self, agent: int) -> None:
         self._logger.warning(f"{agent_names([agent])} is lost: it has not been heard of for a while")
