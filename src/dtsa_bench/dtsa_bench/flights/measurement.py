@@ -81,7 +81,7 @@ class FlightMeasurement(ChannelObserver):
         self.hearing.add_slot(len(verdict.senders), mask)
         heard = [(slot, frames[sender], mask[row]) for row, sender in enumerate(verdict.senders) if mask[row].any()]
         if answers.receipts is not None:  # in real time the receivers themselves know best
-            heard = [(taken.slot, taken.data, taken.mask) for taken in answers.receipts]
+            heard = [(taken.slot, taken.data, taken.mask) for taken in answers.receipts.values()]
         for sent_slot, data, receivers in heard:
             if self.tables.hear(sent_slot, data, receivers):
                 self.hearing.add_accepted(receivers)

@@ -119,7 +119,7 @@ class TimingStatistics(ChannelObserver):
         self._delays = Delays(agents)  # by receiver, from a frame's arrival by the channel's time line
 
     def arbitrated(self, slot: int, answers: Answers, verdict: Verdict) -> None:
-        for taken in answers.receipts or ():
+        for taken in (answers.receipts or {}).values():
             receivers = np.flatnonzero(taken.mask)
             self._delays.add_many(taken.at_ns[receivers] - taken.arrival_ns, receivers)
 

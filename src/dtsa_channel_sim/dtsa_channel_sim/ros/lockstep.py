@@ -110,14 +110,14 @@ class LockstepChannel(RosChannel):
         """Check one message; return whether it is an answer that was missing."""
         try:
             message = self._decoded(data, Transmission, TRANSMISSION.read_fields)
-            self.roster.check_sender(message.agent, self.loop.sender)
+            at = self.roster.check_sender(message.agent, self.loop.sender)
             if message.slot < slot:
                 return False  # an answer that was asked for twice
             if message.slot > slot:
                 raise BadMessage(
                     SLOT, f"{agent_names(message.agent)} answered slot {message.slot}, which has not begun"
                 )
-            return self.answers.add(message)
+            return self.answers.add(at, message)
         except BadMessage as error:
             self.intake.drop(error.reason, str(error))
             if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent of this run sent it

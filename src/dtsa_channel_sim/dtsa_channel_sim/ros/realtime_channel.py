@@ -28,7 +28,7 @@ from dtsa_channel_sim.model.air import NEVER, FrameVerdict, LiveAir
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .answers import Accounts, Answers
+from .answers import Accounts, Answers, places_of
 from .ros_channel import RosChannel
 
 _NS = 1_000_000_000
@@ -205,7 +205,7 @@ class RealtimeChannel(RosChannel):
             with suppress(Exception):  # rclpy has no common base for what a message can do to it
                 message = read_report(data)
                 if message.run == self.run_id and message.slot.tolist() == [number]:
-                    accounts.add(message, number)
+                    accounts.add(places_of(message.agent, self.agents), message, number)
                     present.update(message.agent)
         return present
 
@@ -352,11 +352,11 @@ class RealtimeChannel(RosChannel):
         """
         if self.lost and not self.lost.isdisjoint(message.agent[: self.agents]):
             self._meet_processes()
-        self.roster.check_sender(message.agent, self._reports.sender)
+        at = self.roster.check_sender(message.agent, self._reports.sender)
         now = self._now()
         if len(message.slot) and message.slot[0] >= names.FIRST_CALL:
             return  # an answer to a call, which has come late
-        self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
+        self._newest = max(self._newest, self.accounts.add(at, message, now // self.slot_ns + _AHEAD))
         self._hear(message.agent, now)
         self._observers.report(message)
 
@@ -367,8 +367,8 @@ class RealtimeChannel(RosChannel):
             return False
         if now >= max(end + self._patience_ns, self._recovered_ns):
             return True
-        silent = self.accounts.silent(self.slot + 2)
-        return silent is not None and not set(silent) - self.lost
+        book = self.accounts[self.slot + 2]
+        return bool(book.answered.any()) and not set(book.silent) - self.lost
 
     def _close_slot(self) -> bool:
         """Tell the observers of a slot that has passed; return False when the run is over."""
@@ -380,7 +380,6 @@ class RealtimeChannel(RosChannel):
         resolved = self._resolved.pop(slot, [])
         book.frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in resolved}
         verdict = Verdict.of([verdict.sender for verdict in resolved], resolved)
-        book.receipts = self.accounts.receipts(slot)
         self._observers.arbitrated(slot, book, verdict)
         self._publish_clock(names.slot_time_ns(slot, self.slot_ns))
         self._observers.slot_over(slot, book, verdict)

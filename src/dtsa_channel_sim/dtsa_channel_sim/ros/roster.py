@@ -17,6 +17,8 @@ from dtsa_agent.ros.common.checks import BadMessage
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_agent.ros.common.runs import run_text
 
+from .answers import Places, places_of
+
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s
 _LEFT_OVER_S = 3.0  # agents whose channel has gone end within this time
@@ -32,6 +34,7 @@ class Member:
     ids: tuple[int, ...]
     heard_s: float  # monotonic, when its last message about itself came
     sender: bytes | None  # participant of all its messages; None: not known
+    places: Places
     dropped: dict[str, int] = field(default_factory=dict)
 
 
@@ -110,7 +113,8 @@ class Roster:
         """A process publishes about itself for the first time."""
         if message.process in self._rivals:
             return self._rivals[message.process][0]
-        member = Member(message.process, message.node, tuple(message.agent), now_s, sender)
+        places = places_of(message.agent, self._agents)
+        member = Member(message.process, message.node, tuple(message.agent), now_s, sender, places)
         self._compare(message)
         if self._of.keys().isdisjoint(member.ids):
             self._replace(member)
@@ -167,9 +171,9 @@ class Roster:
             allowed = f"no process of another run on these topics; it has {agent_names(message.agent)}"
             raise ConfigError(f"run of {message.node}", run_text(message.run), allowed)
 
-    def check_sender(self, ids: Any, sender: bytes | None) -> None:
-        """Check that a message can be from the process that has some agents."""
-        _admit(self._groups.get(ids.tobytes()), ids, sender)
+    def check_sender(self, ids: Any, sender: bytes | None) -> Places:
+        """Check that a message can be from the process that has some agents; return their places."""
+        return _admit(self._groups.get(ids.tobytes()), ids, sender).places
 
     def check_frame(self, agent: int, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
@@ -183,12 +187,13 @@ class Roster:
         return total
 
 
-def _admit(member: Member | None, ids: Any, sender: bytes | None) -> None:
+def _admit(member: Member | None, ids: Any, sender: bytes | None) -> Member:
     if member is None:
         raise BadMessage(checks.UNKNOWN, f"a message for {agent_names(ids[:8])}, which no process has")
     if sender != member.sender:
         detail = f"a message for {agent_names(ids[:8])} that is not of {member.node}"
         raise BadMessage(checks.OTHER_SENDER, detail)
+    return member
 
 
 def _key(ids: tuple[int, ...]) -> bytes:
