@@ -114,8 +114,7 @@ def test_schedule_against_its_definition(entries):
         expected = schedule[max(live)[1]]["loss"] if live else 0.0
         epoch = timeline.at(slot)
         assert epoch.config.loss == expected
-        assert epoch.first <= slot
-        assert epoch.end is None or slot < epoch.end
+        assert epoch.first <= slot < epoch.end
 
 
 def test_set_takes_effect_from_the_next_slot_and_replays():

@@ -77,7 +77,7 @@ class RecordedFlight:
         self._timing = TimingStatistics(run.swarm.agents)
         if run.mode != LOCKSTEP:
             self.channel.observe(self._timing)
-        follow_parameters(node, model, self.channel.change_settings)
+        follow_parameters(node, self.channel)
 
     def summary(self) -> dict[str, Any]:
         """The flight's results."""

@@ -22,7 +22,7 @@ from dtsa_agent.core.swarm import Swarm
 from dtsa_channel_sim.model.air import NEVER, Air, Arrivals
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import ChannelConfig
-from dtsa_channel_sim.model.losses import Losses, NoiseSource
+from dtsa_channel_sim.model.losses import Losses
 from dtsa_channel_sim.model.medium import Mask, Positions
 
 SLOTTED = ("tdma", "age", "error", "lease")
@@ -247,6 +247,6 @@ class Transport:
         losses = self._noise.get(message.topic)
         if losses is None:
             digest = hashlib.sha256(f"{self.config.seed} {message.topic}".encode()).digest()
-            source = NoiseSource(int.from_bytes(digest[:8], "little") >> 1, self.config.agents)
-            losses = self._noise[message.topic] = Losses(self.config, source)
+            config = replace(self.config, seed=int.from_bytes(digest[:8], "little") >> 1)
+            losses = self._noise[message.topic] = Losses(config)
         return losses.lost(message.number, message.sender)

@@ -23,7 +23,6 @@ from dtsa_agent.ros.common.messages import SLOT, time_of
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_agent.ros.common.runs import Patience, Run, run_text
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.schedule import Change
 
 from .answers import Answers
 from .observer import ChannelObserver, Observers
@@ -98,9 +97,12 @@ class RosChannel:
         """Add observers; they are called in this order, after those that are there already."""
         self._observers.add(*observers)
 
-    def change_settings(self, change: Change) -> None:
-        """Tell the observers of a change of the medium's settings."""
-        self._observers.settings_changed(change)
+    def change_settings(self, **values: Any) -> None:
+        """Change settings of the medium from the next slot on, and tell the observers.
+
+        :raises ConfigError: for values that are not allowed.
+        """
+        self._observers.settings_changed(self.model.set(**values))
 
     def run(self, stop: object) -> None:
         """Run until the run is over or ``stop`` is true. The agents are told to end.

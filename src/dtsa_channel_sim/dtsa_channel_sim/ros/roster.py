@@ -31,7 +31,7 @@ class Member:
 
     process: int
     node: str
-    ids: tuple[int, ...]
+    ids: array[int]
     heard_s: float  # monotonic, when its last message about itself came
     sender: bytes | None  # participant of all its messages; None: not known
     places: Places
@@ -50,7 +50,6 @@ class Roster:
         self._agreed = {name: (value, channel) for name, value in agreed.items()}  # and the node that has said so
         self._members: dict[int, Member] = {}  # by process
         self._of: dict[int, Member] = {}  # by agent
-        self._groups: dict[bytes, Member] = {}  # by the ids of all agents of a process, as messages carry them
         self._rivals: dict[int, tuple[Member, float]] = {}  # processes that claim agents of a member, since when
         self._left_over: dict[int, float] = {}  # processes of another run, since when
         self._gone: Counter[str] = Counter()  # what processes that have been replaced had dropped
@@ -100,7 +99,7 @@ class Roster:
         member = self._members.get(message.process) or self._meet(message, now_s, sender)
         if member.sender != sender:
             raise BadMessage(checks.OTHER_SENDER, f"a message about {message.node} that is not its own")
-        if member.ids != tuple(message.agent):
+        if member.ids != message.agent:
             raise BadMessage(checks.UNKNOWN, f"{message.node} for other agents than before")
         member.heard_s = now_s
         member.dropped = dict(zip(message.dropped_reason, message.dropped, strict=True))
@@ -114,7 +113,7 @@ class Roster:
         if message.process in self._rivals:
             return self._rivals[message.process][0]
         places = places_of(message.agent, self._agents)
-        member = Member(message.process, message.node, tuple(message.agent), now_s, sender, places)
+        member = Member(message.process, message.node, message.agent, now_s, sender, places)
         self._compare(message)
         if self._of.keys().isdisjoint(member.ids):
             self._replace(member)
@@ -129,10 +128,9 @@ class Roster:
         for before in [self._of[agent] for agent in member.ids if agent in self._of]:
             if self._members.pop(before.process, None):
                 self._gone.update(before.dropped)
-                del self._groups[_key(before.ids)]
                 for other in before.ids:
                     self._of.pop(other, None)
-        self._members[member.process] = self._groups[_key(member.ids)] = member
+        self._members[member.process] = member
         self._of.update(dict.fromkeys(member.ids, member))
 
     def _conflict(self, rival: Member, taken: Set[int]) -> ConfigError:
@@ -173,7 +171,8 @@ class Roster:
 
     def check_sender(self, ids: Any, sender: bytes | None) -> Places:
         """Check that a message can be from the process that has some agents; return their places."""
-        return _admit(self._groups.get(ids.tobytes()), ids, sender).places
+        member = self._of.get(ids[0]) if ids else None
+        return _admit(member if member is not None and member.ids == ids else None, ids, sender).places
 
     def check_frame(self, agent: int, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
@@ -194,7 +193,3 @@ def _admit(member: Member | None, ids: Any, sender: bytes | None) -> Member:
         detail = f"a message for {agent_names(ids[:8])} that is not of {member.node}"
         raise BadMessage(checks.OTHER_SENDER, detail)
     return member
-
-
-def _key(ids: tuple[int, ...]) -> bytes:
-    return array("H", ids).tobytes()
