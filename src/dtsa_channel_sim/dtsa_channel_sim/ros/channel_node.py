@@ -75,7 +75,7 @@ def watch(channel: RosChannel, node: Node, settings: Mapping[str, Any], space: s
     """Tell the graph how a run is doing: topics in the swarm's namespace, diagnostics, transforms, the log."""
     channel.observe(
         RunLog(node, channel.run_id, isinstance(channel, LockstepChannel)),
-        RunTopics(node, settings, channel.run_id, channel.slot_ns, space),
+        RunTopics(node, settings, channel, space),
         Diagnostics(node, channel),
     )
     try:

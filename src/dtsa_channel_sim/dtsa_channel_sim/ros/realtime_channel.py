@@ -325,7 +325,9 @@ class RealtimeChannel(RosChannel):
         for verdict in self.air.pop_arrived(now, self.answers.position):
             slot, sender = verdict.frame_id
             self._resolved.setdefault(max(slot, self.slot + 1), []).append(verdict)
-            self.pace.lag.add(self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns))
+            lag_ns = self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns)
+            self.pace.lag.add(lag_ns)
+            self.lag_ms = lag_ns / 1e6
             if not verdict.received.any():
                 continue
             frame = self.air.frames[verdict.frame_id]

@@ -69,6 +69,7 @@ class RosChannel:
         self._observers = Observers()
         self._over, self._slots = over, slots
         self.fell_behind = ""  # why the run could not go on; real time only
+        self.lag_ms = 0.0  # by which the last frame was delivered late; real time only
         self._reason, self._failed = "", False  # why the run has ended, and whether an error ended it
         self._startup_s, self._end_s = startup_s, end_s
         self._publisher = node.create_publisher(Slot, f"{swarm_namespace}/{names.SLOT}", names.lockstep_qos(waiting))

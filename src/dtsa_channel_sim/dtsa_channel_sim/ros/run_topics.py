@@ -70,14 +70,12 @@ class RunState:
 class RunTopics(ChannelObserver):
     """Publishes ``configuration`` and ``status`` in the swarm's namespace, transient local, for late subscribers."""
 
-    def __init__(
-        self, node: Node, settings: Mapping[str, Any], run_id: int, slot_ns: int, swarm_namespace: str = names.SWARM
-    ) -> None:
-        qos = names.latched_qos()
+    def __init__(self, node: Node, settings: Mapping[str, Any], channel: RosChannel, swarm_namespace: str) -> None:
+        qos, self._channel = names.latched_qos(), channel
         self._settings = node.create_publisher(Configuration, f"{swarm_namespace}/{names.CONFIGURATION}", qos)
-        self._settings.publish(configuration_message(settings, run_id))
+        self._settings.publish(configuration_message(settings, channel.run_id))
         self._status = node.create_publisher(RunStatus, f"{swarm_namespace}/{names.STATUS}", qos)
-        self._state = RunState(run_id, slot_ns)
+        self._state = RunState(channel.run_id, channel.slot_ns)
         self._state.reach(0)
         self._publish()
 
@@ -100,7 +98,7 @@ class RunTopics(ChannelObserver):
 
     def idle(self, slot: int, awaited: list[int]) -> None:
         before = list(self._state.message.awaited)
-        self._state.reach(slot, awaited=awaited)
+        self._state.reach(slot, awaited=awaited, lag_ms=self._channel.lag_ms)
         if before != list(self._state.message.awaited) or time.monotonic() >= self._next_s:
             self._publish()
 
