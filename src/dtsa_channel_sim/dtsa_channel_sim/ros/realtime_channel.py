@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -198,10 +199,7 @@ class RealtimeChannel(RosChannel):
     def _answered_call(self, number: int, accounts: Accounts) -> set[int]:
         """Return the agents whose answers to a call of this number have come since this was asked."""
         present: set[int] = set()
-        for _ in range(_BURST):
-            data = self._reports.take()
-            if data is None:
-                break
+        for data in islice(iter(self._reports.take, None), _BURST):
             with suppress(Exception):  # rclpy has no common base for what a message can do to it
                 message = read_report(data)
                 if message.run == self.run_id and message.slot.tolist() == [number]:

@@ -7,6 +7,7 @@ import time
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any
 
 from dtsa_msgs.msg import Process, Slot
@@ -176,10 +177,7 @@ class RosChannel:
         first_s: dict[int, float] = {}  # by run: when its first message came
 
         def check() -> None:
-            for _ in range(_MOST_PROCESSES):
-                message = feed.take()
-                if message is None:
-                    return
+            for message in islice(iter(feed.take, None), _MOST_PROCESSES):
                 if message.run in (0, self.run_id) or len(first_s) >= _MOST_PROCESSES:
                     continue
                 with self.intake.guard():
@@ -233,10 +231,7 @@ class RosChannel:
 
         :raises ConfigError: before the run has begun, when two do not fit together.
         """
-        for _ in range(_MOST_PROCESSES):
-            message = self._processes.take()
-            if message is None:
-                return
+        for message in islice(iter(self._processes.take, None), _MOST_PROCESSES):
             with self.intake.guard():
                 try:
                     self.roster.hear(message, time.monotonic(), self._processes.sender)

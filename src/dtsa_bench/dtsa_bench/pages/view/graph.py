@@ -8,6 +8,7 @@ import re
 import time
 from collections import deque
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from builtin_interfaces.msg import Duration
@@ -145,10 +146,7 @@ class GraphSource:
         while (event := self._changes.take()) is not None:
             if event.node == f"{self._space}/channel":
                 follower.receive("ParameterEvent", event)
-        for _ in range(_MAX_WAITING):
-            record = self._records.take()
-            if record is None:
-                break
+        for record in islice(iter(self._records.take, None), _MAX_WAITING):
             if record.run == self._run:
                 follower.receive("SlotRecord", record)
 
