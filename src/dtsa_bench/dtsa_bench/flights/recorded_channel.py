@@ -69,7 +69,7 @@ class RecordedFlight:
         )
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
-            FlightRecorder(directory / BAG, run, self.scenario, self.run_id),
+            FlightRecorder(directory / BAG, run, self.scenario, self.channel),
             self.measurement,
             LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id, space),
         )

@@ -116,7 +116,6 @@ class RealtimeChannel(RosChannel):
         self.air = LiveAir(channel)
         self.pace = Pace(self.slot_ns)
         self.round_ms: float | None = None  # of the last round of messages before slot 0
-        self.returned: set[int] = set()  # ids of agents that were lost, and report again
         self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
         self._heard_ns = np.zeros(self.agents, dtype=np.int64)  # when each was heard last
         self._steps = steps

@@ -66,7 +66,8 @@ class RosChannel:
         self.intake = Intake(node.get_logger())
         self.slot = -1
         self.answers = Answers(self.agents, steps)
-        self.lost: set[int] = set()  # ids of agents that have fallen silent
+        self.lost: set[int] = set()  # ids of agents that have fallen silent; real time only
+        self.returned: set[int] = set()  # ids of agents that had, and report again; real time only
         self._observers = Observers()
         self._over, self._slots = over, slots
         self.fell_behind = ""  # why the run could not go on; real time only

@@ -39,32 +39,13 @@ def configuration_message(settings: Mapping[str, Any], run_id: int) -> Configura
     )
 
 
-class RunState:
-    """The status of a run, a dtsa_msgs/RunStatus, by what happens."""
-
-    def __init__(self, run_id: int, slot_ns: int) -> None:
-        self.message, self._slot_ns = RunStatus(run=run_id, phase=RunStatus.WAITING), slot_ns
-
-    def reach(self, slot: int, **changed: Any) -> None:
-        """Note that a run has come to a slot, -1: none yet, and fields that have changed."""
-        self.message.slot = max(0, slot)
-        self.message.header = header_of(names.slot_time_ns(self.message.slot, self._slot_ns))
-        for name, value in changed.items():
-            setattr(self.message, name, value)
-        if self.message.phase != RunStatus.WAITING:
-            self.message.awaited = []
-
-    def lose(self, agent: int) -> None:
-        """Note that an agent has fallen silent."""
-        self._move([agent], "returned", "lost")
-
-    def regain(self, agents: list[int]) -> None:
-        """Note that agents report again."""
-        self._move(agents, "lost", "returned")
-
-    def _move(self, agents: list[int], source: str, to: str) -> None:
-        setattr(self.message, source, sorted(set(getattr(self.message, source)) - set(agents)))
-        setattr(self.message, to, sorted({*getattr(self.message, to), *agents}))
+def status_message(channel: RosChannel, phase: int, slot: int, **more: Any) -> RunStatus:
+    """Return a dtsa_msgs/RunStatus of a run that has come to a slot, -1: none yet."""
+    return RunStatus(
+        header=header_of(names.slot_time_ns(max(0, slot), channel.slot_ns)),
+        run=channel.run_id, phase=phase, slot=max(0, slot),
+        lost=sorted(channel.lost), returned=sorted(channel.returned), **more,
+    )  # fmt: skip
 
 
 class RunTopics(ChannelObserver):
@@ -75,36 +56,34 @@ class RunTopics(ChannelObserver):
         self._settings = node.create_publisher(Configuration, f"{swarm_namespace}/{names.CONFIGURATION}", qos)
         self._settings.publish(configuration_message(settings, channel.run_id))
         self._status = node.create_publisher(RunStatus, f"{swarm_namespace}/{names.STATUS}", qos)
-        self._state = RunState(channel.run_id, channel.slot_ns)
-        self._state.reach(0)
+        self._phase, self._slot, self._awaited = RunStatus.WAITING, -1, list[int]()
         self._publish()
 
-    def _publish(self) -> None:
+    def _publish(self, reason: str = "") -> None:
         self._next_s = time.monotonic() + _STATUS_S
-        self._status.publish(self._state.message)
+        values = {"awaited": self._awaited, "lag_ms": self._channel.lag_ms, "reason": reason}
+        self._status.publish(status_message(self._channel, self._phase, self._slot, **values))
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         if not slot:
-            self._state.reach(0, phase=RunStatus.FLYING)
+            self._phase, self._slot, self._awaited = RunStatus.FLYING, 0, []
             self._publish()
 
     def agent_silent(self, agent: int) -> None:
-        self._state.lose(agent)
         self._publish()
 
     def agents_back(self, agents: list[int]) -> None:
-        self._state.regain(agents)
         self._publish()
 
     def idle(self, slot: int, awaited: list[int]) -> None:
-        before = list(self._state.message.awaited)
-        self._state.reach(slot, awaited=awaited, lag_ms=self._channel.lag_ms)
-        if before != list(self._state.message.awaited) or time.monotonic() >= self._next_s:
+        before, self._slot = self._awaited, slot
+        self._awaited = awaited if self._phase == RunStatus.WAITING else []
+        if before != self._awaited or time.monotonic() >= self._next_s:
             self._publish()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
-        self._state.reach(slot, phase=RunStatus.ENDED, reason=reason)
-        self._publish()
+        self._phase, self._slot, self._awaited = RunStatus.ENDED, slot, []
+        self._publish(reason)
 
 
 class Diagnostics(ChannelObserver):
