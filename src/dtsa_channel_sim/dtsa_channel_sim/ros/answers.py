@@ -126,7 +126,7 @@ class Answers:
         return True
 
     def add_report(self, at: Places, message: Fields, row: int) -> None:
-        """Add what some agents report for one slot, a row of a report; checked before."""
+        """Add what some agents report for one slot, a row of a report that was checked."""
         count, rows = len(message.agent), len(message.slot)
         motion = [getattr(message, name).reshape(rows, -1)[row] for name in _MOTION]
         self._motion[:, at] = np.concatenate(motion).reshape(-1, count)
@@ -211,7 +211,7 @@ class Accounts:
         :param at: places of its agents.
         :raises BadMessage: if its fields do not fit together.
         """
-        _check_report(message, self._steps)
+        check_report(message, self._steps)
         slots = message.slot.tolist()
         last = max(slots[-1] if slots else 0, max(message.heard_in.tolist(), default=0))
         if last > latest:
@@ -255,8 +255,11 @@ def received_in(message: Fields) -> Iterator[tuple[int, int, int, int, NDArray[n
     return zip(*(column.tolist() for column in columns), masks, strict=True)
 
 
-def _check_report(message: Fields, steps: int) -> None:
-    """Check that the fields of a report fit together."""
+def check_report(message: Fields, steps: int) -> None:
+    """Check that the fields of a report fit together.
+
+    :raises BadMessage: if they do not.
+    """
     count, slots, heard = len(message.agent), len(message.slot), len(message.heard_sender)
     sizes = {"offset_ns": count * slots, "length": count * slots, **sizes_of(count * slots, steps)}
     sizes |= dict.fromkeys(("heard_slot", "heard_in", "heard_ns"), heard) | {"heard_by": heard * -(-count // 8)}

@@ -29,7 +29,7 @@ from dtsa_channel_sim.model.air import NEVER, FrameVerdict, LiveAir
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .answers import Accounts, Answers, places_of
+from .answers import Accounts, Answers, check_report, places_of
 from .ros_channel import RosChannel
 
 _NS = 1_000_000_000
@@ -171,22 +171,14 @@ class RealtimeChannel(RosChannel):
         """Wait until all agents have reported, and publish when slot 0 starts; return False when stopped."""
         if not self._call(stop, self.lost):
             return False
-        accounts = Accounts(self.agents, self._steps, 1)
-        awaited = set(range(1, self.agents + 1))
 
         def still_awaited() -> set[int]:
-            awaited.difference_update(self._answered_call(names.FIRST_CALL, accounts))
-            self.answers.missing = len(awaited)
-            self.answers.answered[:] = [agent not in awaited for agent in range(1, self.agents + 1)]
-            return awaited - self.lost
+            self._answered_call(names.FIRST_CALL)
+            return set(self.answers.silent) - self.lost
 
         if not self._await_all(stop, still_awaited, _TICK_NS):
             return False
-        # An agent that is late with its first report has been nowhere else.
-        answers = accounts[names.FIRST_CALL]
-        answers.carry(self.answers)
-        self.answers = answers
-        self._await_short_round(stop, accounts)
+        self._await_short_round(stop)
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS
@@ -195,18 +187,24 @@ class RealtimeChannel(RosChannel):
         self._heard_ns[:] = 0
         return True
 
-    def _answered_call(self, number: int, accounts: Accounts) -> set[int]:
-        """Return the agents whose answers to a call of this number have come since this was asked."""
+    def _answered_call(self, number: int) -> set[int]:
+        """Return the agents whose answers to a call of this number have come since this was asked.
+
+        The first answer of each says where it is: one that is late with its first report has been nowhere else.
+        """
         present: set[int] = set()
         for data in islice(iter(self._reports.take, None), _BURST):
             with suppress(Exception):  # rclpy has no common base for what a message can do to it
                 message = read_report(data)
                 if message.run == self.run_id and message.slot.tolist() == [number]:
-                    accounts.add(places_of(message.agent, self.agents), message, number)
+                    at = places_of(message.agent, self.agents)
+                    check_report(message, self._steps)
+                    if not self.answers.answered[at].any():
+                        self.answers.add_report(at, message, 0)
                     present.update(message.agent)
         return present
 
-    def _await_short_round(self, stop: object, accounts: Accounts) -> None:
+    def _await_short_round(self, stop: object) -> None:
         """Call until a round of messages, from a call to the last answer, is short enough, or for some seconds.
 
         Many processes may have found the channel and still look for each other.
@@ -218,7 +216,7 @@ class RealtimeChannel(RosChannel):
             self._publish_call(number)
             while awaited and time.monotonic() < begin_s + _LONGEST_S:
                 time.sleep(_PAUSE_S)
-                awaited -= self._answered_call(number, accounts)
+                awaited -= self._answered_call(number)
             self.round_ms = (time.monotonic() - begin_s) * 1e3
             if not self.tight:
                 return
