@@ -97,6 +97,7 @@ class Follower:
         self._index(senders)
         mask = unpack_received(bytes(np.asarray(record.received, np.uint8)), len(senders), self.agents)
         frames = split_frames(bytes(np.asarray(record.data, np.uint8)), np.asarray(record.length).tolist())
+        received = [(slot, frame, row) for frame, row in zip(frames, mask, strict=True) if row.any()]
         position = self._position.copy()  # of agents that are lost: the last one
         position[:, index] = np.reshape(record.track, (record.steps, 3, len(index)))[-1]
         if not np.abs(position).max() < _FARTHEST_M:
@@ -113,8 +114,7 @@ class Follower:
             self._add_moment(slot)
         if self._replay is not None:
             self._replay.delivery.add_slot(len(senders), mask)
-            arrived = [(slot, frame, row) for frame, row in zip(frames, mask, strict=True) if row.any()]
-            self._replay.step(slot, arrived)
+            self._replay.step(slot, received)
         self._builder.add_frames(slot, int(record.outcome), senders, self._reason, mask.astype(bool))
         self._builder.add_choices(self._chosen)
         self._slot = slot + 1
