@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
@@ -151,25 +152,27 @@ class Bridge:
             vehicle.stop(reason)
 
     def _run_rules(self) -> None:
-        keep_alive = 0.0
+        keep_alive, vehicles = 0.0, self.vehicles.values()
         while not self._closing.wait(TICK_S):
             now = time.monotonic()
-            feed = now >= keep_alive
-            keep_alive = now + 1.0 / WATCHDOG_HZ if feed else keep_alive
-            try:
-                self._apply_rules(now, feed)
-            except Exception as error:  # of one vehicle: the rules of the others must go on
-                self._log("error", f"safety: {type(error).__name__}: {error}")
+            if now >= keep_alive:
+                keep_alive = now + 1.0 / WATCHDOG_HZ
+                for vehicle in vehicles:
+                    self._attempt(vehicle.feed_watchdog, now)
+            states = [self._attempt(vehicle.watched_state, now) for vehicle in vehicles]
+            age = None if self.heartbeat is None else now - self.heartbeat
+            for required in self._attempt(self.monitor.check, now, list(filter(None, states)), age) or ():
+                self._attempt(self._carry_out, required, now)
+            for vehicle in vehicles:
+                self._attempt(vehicle.tick, now)
 
-    def _apply_rules(self, now: float, feed: bool) -> None:
-        vehicles = self.vehicles.values()
-        age = None if self.heartbeat is None else now - self.heartbeat
-        for vehicle in vehicles if feed else ():  # before the rules: if one fails, no motors stop for that
-            vehicle.feed_watchdog(now)
-        for required in self.monitor.check(now, [v.watched_state(now) for v in vehicles], age):
-            self._carry_out(required, now)
-        for vehicle in vehicles:
-            vehicle.tick(now)
+    def _attempt(self, act: Callable[..., Any], *arguments: Any) -> Any:
+        """Do a part of the rules; if it fails, say so: the other rules, and those of other vehicles, go on."""
+        try:
+            return act(*arguments)
+        except Exception as error:
+            self._log("error", f"safety: {type(error).__name__}: {error}")
+            return None
 
     def _carry_out(self, required: RequiredAction, now: float) -> None:
         action, reason = required.action, required.reason

@@ -162,6 +162,23 @@ def test_rules_that_fail_stop_no_motors(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.realtime
+def test_rules_of_a_vehicle_that_fail_leave_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with fake_fleet(tmp_path, 2) as fleet, flight(settings(fleet)) as pilot:
+        pilot.bridge.connect()
+        pilot.take_off()
+        failing, other = pilot.bridge.vehicles.values()
+        with monkeypatch.context() as broken:
+            for part in ("watched_state", "tick"):
+                broken.setattr(failing, part, lambda now: 1 / 0)
+            pilot.velocity["cf2"] = (0.0, 1.0, 0.0)  # out of the geofence
+            wait_for(lambda: other.state is State.LANDING, 20)
+        pilot.logged("safety: ZeroDivisionError")
+        pilot.logged("cf2: geofence: ")
+        pilot.bridge.land_all("test over")
+        assert pilot.bridge.wait_landed(lambda: False) == []
+
+
+@pytest.mark.realtime
 def test_crazyswarm2s_voltages_count_on_the_ground_alone(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2) as fleet:
         data = settings(fleet, battery={"voltage_warning": 3.8, "voltage_critical": 3.7})  # of its stock file
