@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import time
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Set
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Set
 from itertools import islice
 from typing import Any
 
@@ -134,14 +133,19 @@ class RosChannel:
         :raises ConfigError: when two do not fit together, or another channel is there.
         :raises LocalProtocolError: when some do not answer in time.
         """
-        with self._watch_other_channels() as check_others:
+        others = Feed(self.node, Slot, self._publisher.topic_name, names.lockstep_qos(), intake=self.intake)
+        first_s: dict[int, float] = {}  # by another run: when its first message came
 
-            def awaited() -> set[int]:
-                self._read_processes()
-                check_others()
-                return self.roster.awaited(time.monotonic(), absent)
+        def awaited() -> set[int]:
+            self._read_processes()
+            self._check_other_channels(others, first_s)
+            return self.roster.awaited(time.monotonic(), absent)
 
+        try:
             self.roster.closed = self._await_all(stop, awaited, _CALL_NS)
+        finally:
+            others.close()
+            self.node.destroy_subscription(others.subscription)
         return self.roster.closed
 
     def _publish_call(self, number: int) -> None:
@@ -170,32 +174,24 @@ class RosChannel:
                 )
         return True
 
-    @contextmanager
-    def _watch_other_channels(self) -> Iterator[Callable[[], None]]:
-        """Listen to the channel's own topic; give a function that checks what others publish there."""
-        topic = self._publisher.topic_name
-        feed = Feed(self.node, Slot, topic, names.lockstep_qos(), intake=self.intake)
-        first_s: dict[int, float] = {}  # by run: when its first message came
+    def _check_other_channels(self, feed: Feed, first_s: dict[int, float]) -> None:
+        """Check what others publish on the channel's own topic.
 
-        def check() -> None:
-            for message in islice(iter(feed.take, None), _MOST_PROCESSES):
-                if message.run in (0, self.run_id) or len(first_s) >= _MOST_PROCESSES:
-                    continue
-                with self.intake.guard():
-                    checks.check_slot(message, self.agents)
-                    now = time.monotonic()
-                    waited_s = now - first_s.setdefault(message.run, now)
-                    if waited_s > _OTHER_CHANNEL_S:
-                        others = self._other_nodes(topic)
-                        if others or waited_s > _OTHER_CHANNEL_S + _NAME_S:
-                            allowed = f"no other channel on {topic}; there is {others or 'a node without a name yet'}"
-                            raise ConfigError("run", str(self._identity), allowed)
-
-        try:
-            yield check
-        finally:
-            feed.close()
-            self.node.destroy_subscription(feed.subscription)
+        :raises ConfigError: when another channel is there.
+        """
+        for message in islice(iter(feed.take, None), _MOST_PROCESSES):
+            if message.run in (0, self.run_id) or len(first_s) >= _MOST_PROCESSES:
+                continue
+            with self.intake.guard():
+                checks.check_slot(message, self.agents)
+                now = time.monotonic()
+                waited_s = now - first_s.setdefault(message.run, now)
+                if waited_s > _OTHER_CHANNEL_S:
+                    topic = self._publisher.topic_name
+                    others = self._other_nodes(topic)
+                    if others or waited_s > _OTHER_CHANNEL_S + _NAME_S:
+                        allowed = f"no other channel on {topic}; there is {others or 'a node without a name yet'}"
+                        raise ConfigError("run", str(self._identity), allowed)
 
     def _other_nodes(self, topic: str) -> str:
         """Return the nodes that publish on a topic beside this one; empty: the graph does not know their names yet."""
