@@ -120,6 +120,7 @@ class LockstepChannel(RosChannel):
             return self.answers.add(at, message)
         except BadMessage as error:
             self.intake.drop(error.reason, str(error))
-            if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent of this run sent it
+            # A stranger's garbage is no reason to give an agent up.
+            if error.reason not in (OTHER_RUN, OTHER_SENDER) and self.roster.is_member(self.loop.sender):
                 self._complaint, self._complaint_time = str(error), time.monotonic()
             return False

@@ -174,6 +174,10 @@ class Roster:
         member = self._of.get(ids[0]) if ids else None
         return _admit(member if member is not None and member.ids == ids else None, ids, sender).places
 
+    def is_member(self, sender: bytes | None) -> bool:
+        """Whether a sender is a process of this run."""
+        return any(member.sender == sender for member in self._members.values())
+
     def check_frame(self, agent: int, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
         _admit(self._of.get(agent), (agent,), sender)
