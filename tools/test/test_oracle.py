@@ -6,7 +6,7 @@ import pytest
 from dtsa_dev.proofs.both_statements import CheckedFlight, Differs, fly_both, random_setting
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.reference.lease import events, issue
+from dtsa_agent.core.reference import lease, lease_issue
 from dtsa_channel_sim import ChannelConfig
 
 SAMPLE = 10  # settings; `dtsa soak statements` has 200
@@ -34,7 +34,7 @@ def test_flights_are_equal_in_which_few_of_many_move(moving: int) -> None:
 
 @pytest.mark.parametrize(
     ("module", "name", "value"),
-    [(issue, "MISSED", 1), (issue, "RELAY_IDS", 1), (events, "DEAF", 0), (issue, "NEED", 1.0)],
+    [(lease_issue, "MISSED", 1), (lease_issue, "RELAY_IDS", 1), (lease, "DEAF", 0), (lease_issue, "NEED", 1.0)],
 )
 def test_a_rule_that_differs_is_found(monkeypatch: pytest.MonkeyPatch, module: object, name: str, value: float) -> None:
     """The oracle itself: one constant of the specification changed."""

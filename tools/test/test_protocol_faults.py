@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from dtsa_dev.protocol.experiment import Experiment, FlightEvent, random_schedule
+from frame_helpers import encode_extended
 
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
-from dtsa_agent.core.frame import ExtendedFrame, encode_extended
+from dtsa_agent.core.frame import ExtendedFrame
 from dtsa_bench.log.rules import PLAIN, GrantLedger, RuleChecker
 from dtsa_bench.log.verify.result import Mismatch, Result
 from dtsa_channel_sim import ChannelConfig

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_helpers import encode_extended
 
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig
-from dtsa_agent.core.frame import ExtendedFrame, decode_extended, encode_extended
-from dtsa_agent.core.reference.lease.memory import Memory
+from dtsa_agent.core.frame import ExtendedFrame, decode_extended
+from dtsa_agent.core.reference.lease import Memory
 from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_agent.core.reference.table import Rules
 

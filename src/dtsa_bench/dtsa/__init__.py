@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         SwarmConfig,
         plug_in_random,
     )
-    from dtsa_agent.core.plugins.entry_points import Table
+    from dtsa_agent.core.plugins import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
     from dtsa_bench.drawing.palette import agent_colour
     from dtsa_bench.log.bag.errors import BagError, UnusableBag
@@ -56,7 +56,7 @@ _HOMES = {
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "PluginError", "RemoteProtocolError",
         "SlotOutcome", "SwarmConfig", "plug_in_random",
     ),
-    "dtsa_agent.core.plugins.entry_points": ("Table",),
+    "dtsa_agent.core.plugins": ("Table",),
     "dtsa_agent.core.registry": ("REASONS",),
     "dtsa_bench.log.bag.errors": ("BagError", "UnusableBag"),
     "dtsa_bench.drawing.palette": ("agent_colour",),

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.registry import ESTIMATORS, POLICIES, Registry
-from dtsa_agent.core.settings.flight_models import AVOIDERS
+from dtsa_agent.core.settings.config import REGISTRIES
 from dtsa_bench.experiments.sweep import run_config as _run_config
 from dtsa_bench.log.flight_log import FlightLog, log_of_flight
 from dtsa_bench.runs.config import RunConfig
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from dtsa_bench.log.verify.result import Result
 
     from ._settings import RunSettings
-
-_REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in (POLICIES, ESTIMATORS, AVOIDERS)}
 
 
 def run_config(**settings: Unpack[RunSettings]) -> RunConfig:
@@ -114,11 +111,11 @@ def register(kind: str, name: str, factory: Any) -> None:
 
     :raises ConfigError: for a kind that does not exist, a built-in name, or a factory that cannot be called.
     """
-    if kind not in _REGISTRIES:
-        raise ConfigError("kind", kind, ", ".join(_REGISTRIES))
-    _REGISTRIES[kind].register(name, factory)
+    if kind not in REGISTRIES:
+        raise ConfigError("kind", kind, ", ".join(REGISTRIES))
+    REGISTRIES[kind].register(name, factory)
 
 
 def registered() -> dict[str, set[str]]:
     """Names that only this process knows, by kind."""
-    return {kind: registry.registered for kind, registry in _REGISTRIES.items()}
+    return {kind: registry.registered for kind, registry in REGISTRIES.items()}

@@ -9,6 +9,7 @@ from dtsa_agent.core.reference import datagram
 from dtsa_agent.core.reference import station as reference
 from dtsa_agent.core.reference.agent import Agent
 from dtsa_agent.core.reference.arithmetic import Vector
+from dtsa_agent.core.reference.frame import PROFILE_EXTENDED, PROFILE_PAPER
 from dtsa_agent.core.reference.table import Rules, Table
 from dtsa_bench.simulation.live import LiveFlight, S, _c_flight, fly
 
@@ -28,8 +29,8 @@ def rules_of(flight: LiveFlight) -> Rules:
     """What ``_c_flight`` sets, in plain Python."""
     return Rules(
         agents=flight.agents, slot_s=flight.slot_ns / S, policy=flight.policy, key=5, depth_rate=0.5,
-        profile="extended" if flight.policy == "lease" else "paper", main_every=15, anchor_every=flight.anchor_every,
-        open_every=11,
+        profile=PROFILE_EXTENDED if flight.policy == "lease" else PROFILE_PAPER, main_every=15,
+        anchor_every=flight.anchor_every, open_every=11,
     )  # fmt: skip
 
 
@@ -86,7 +87,7 @@ class PlainStations:
     def _open(self, call: Any) -> reference.Station:
         c, flight, host = self._c.station, self.flight, call.host
         index = call.answer - 1
-        agent = Agent(index, rules_of(flight), Table(index + 1, self._start, self._away))
+        agent = Agent(Table(index + 1, rules_of(flight), self._start, self._away))
         agent.position, agent.goal = self._start[index], self._away[index]
         link = datagram.Link(bytes(c.link.header), True, c.link.names, c.link.flight_ns, c.link.trust_ns)
         begins_ns = None

@@ -115,7 +115,7 @@ def run_settings() -> str:
     lines = []
     for name in sorted(names := setting_specs()):
         spec = names[name]
-        closed = spec.kind == "text" and spec.words and not spec.open_choices
+        closed = spec.kind == "text" and spec.choices and not spec.open_choices
         words = [json.dumps(word) for word in spec.choices] if closed else []
         text = f"Literal[{', '.join(words)}]"
         text = text if len(text) < 80 else "".join(["Literal[\n", *(f"        {word},\n" for word in words), "    ]"])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, SwarmConfig
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_bench.log.rules import GrantLedger
 from dtsa_channel_sim import Channel, ChannelConfig
 

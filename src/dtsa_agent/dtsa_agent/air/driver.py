@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.station import HoverReason, Station, StationSettings, check_joinable
 from dtsa_agent.core.swarm import Swarm

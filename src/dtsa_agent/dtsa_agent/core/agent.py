@@ -13,7 +13,7 @@ import numpy as np
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import Vector
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.registry import REASONS
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import Scenario

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,22 +88,13 @@ def encode_frame(frame: Frame, extent_m: float = EXTENT_M) -> bytes:
 
     :raises LocalProtocolError: if a field is not a number or an id is out of range.
     """
-    profile = PROFILE_PAPER if frame.intent is None else PROFILE_PAPER_INTENT
-    return _encode(frame, "dtsa_frame *", lambda: _own(frame, profile), lib.frame_encode, extent_m)
-
-
-def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:
-    """The 56 bytes of an extended frame; gossip saturates beyond half the extent and +-10.2 m/s.
-
-    :raises LocalProtocolError: if a field is out of range, or the sections do not fit.
-    """
-    return _encode(frame, "extended_frame *", lambda: _sections(frame), lib.extended_encode, extent_m)
-
-
-def _encode(frame: object, structure: str, fields: Callable[[], dict[str, Any]], encode: Any, extent_m: float) -> bytes:
     out = ffi.new("uint8_t[]", FRAME_MAX)
     try:
-        length = encode(ffi.new(structure, fields()), position_step(extent_m), out)
+        length = lib.frame_encode(ffi.new("dtsa_frame *", {
+            "profile": PROFILE_PAPER if frame.intent is None else PROFILE_PAPER_INTENT, "sender": frame.sender,
+            "slot": frame.slot & 0xFFFFFFFF, "c_r": frame.c_r, "p": frame.position, "v": frame.velocity,
+            "c": frame.intent or (0.0, 0.0, 0.0),
+        }), position_step(extent_m), out)  # fmt: skip
     except (OverflowError, IndexError, TypeError, ValueError) as error:
         raise LocalProtocolError(f"not encodable: {frame} ({error})") from error
     if not length:
@@ -112,42 +102,12 @@ def _encode(frame: object, structure: str, fields: Callable[[], dict[str, Any]],
     return bytes(ffi.buffer(out, length))
 
 
-def _own(frame: Frame, profile: int) -> dict[str, Any]:
-    return {
-        "profile": profile, "sender": frame.sender, "slot": frame.slot & 0xFFFFFFFF, "c_r": frame.c_r,
-        "p": frame.position, "v": frame.velocity, "c": frame.intent or (0.0, 0.0, 0.0),
-    }  # fmt: skip
-
-
-def _sections(frame: ExtendedFrame) -> dict[str, Any]:
-    far = _mask_of(frame.far, _FAR).to_bytes(lib.FAR_BYTES, "little")
-    gossip = [{"id": g.agent, "age": g.age, "c_r": g.moving, "p": g.position, "v": g.velocity} for g in frame.gossip]
-    return {
-        "own": _own(frame.own, PROFILE_EXTENDED), "c_s": frame.c_s, "leaving": frame.leaving,
-        "probation": frame.probation, "gossip_count": len(gossip), "gossip": gossip,
-        "lease_count": len(frame.leases), "leases": frame.leases,
-        "relay_mask": _mask_of(tuple(ahead for ahead, _ in frame.relay), _NEAR),
-        "relay_ids": bytes(lessee for _, lessee in frame.relay), "far_id": frame.far_lessee, "far_mask": far,
-    }  # fmt: skip
-
-
-def _mask_of(ahead: tuple[int, ...], reach: range) -> int:
-    """Return a mask with a bit for each of the slots ahead; ValueError: they do not ascend, or are out of reach."""
-    if any(slots not in reach for slots in ahead) or list(ahead) != sorted(set(ahead)):
-        raise ValueError(f"slots ahead {ahead}")
-    return sum(1 << (slots - reach.start) for slots in ahead)
-
-
-def _slots_of(mask: int, reach: range) -> tuple[int, ...]:
-    return tuple(slots for slots in reach if mask >> (slots - reach.start) & 1)
-
-
 def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:
-    """The fields of a frame that all profiles have.
+    """The fields of a frame that all profiles have, and the intent where it is carried.
 
     :raises RemoteProtocolError: if the bytes are no frame: sealed ones are opened first.
     """
-    return _frame_of(_decode("dtsa_frame *", lib.frame_decode, data, extent_m), PROFILE_PAPER_INTENT)
+    return _frame_of(_decode("dtsa_frame *", lib.frame_decode, data, extent_m))
 
 
 def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
@@ -160,11 +120,15 @@ def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
     gossip = tuple(Gossip(g.id, g.age, bool(g.c_r), _vector(g.p), _vector(g.v)) for g in entries)
     far = int.from_bytes(bytes(record.far_mask), "little")
     return ExtendedFrame(
-        _frame_of(record.own, PROFILE_EXTENDED), record.c_s, bool(record.leaving), bool(record.probation), gossip,
+        _frame_of(record.own), record.c_s, bool(record.leaving), bool(record.probation), gossip,
         bytes(record.leases)[: record.lease_count],
         tuple(zip(_slots_of(record.relay_mask, _NEAR), record.relay_ids, strict=False)),
         _slots_of(far, _FAR), record.far_id,
     )  # fmt: skip
+
+
+def _slots_of(mask: int, reach: range) -> tuple[int, ...]:
+    return tuple(slots for slots in reach if mask >> (slots - reach.start) & 1)
 
 
 def _decode(record_type: str, decode: Any, data: bytes, extent_m: float) -> Any:
@@ -175,8 +139,8 @@ def _decode(record_type: str, decode: Any, data: bytes, extent_m: float) -> Any:
     return record
 
 
-def _frame_of(record: Any, with_intent: int) -> Frame:
-    intent = _vector(record.c) if record.profile == with_intent else None
+def _frame_of(record: Any) -> Frame:
+    intent = None if record.profile == PROFILE_PAPER else _vector(record.c)
     return Frame(record.sender, record.slot, record.c_r, _vector(record.p), _vector(record.v), intent)
 
 

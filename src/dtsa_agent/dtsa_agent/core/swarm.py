@@ -144,7 +144,7 @@ class Swarm:
         self._share_arrays(kernel, sizes)
         self.local[:], self.observer[:], self.final[:] = np.array(self.ids) - 1, np.array(tables) - 1, 1
         self.known_goal[:] = self.scenario.target
-        self.course: Course | None = self.scenario.course(self.local)  # where they are in the scenario's plan
+        self.course: Course | None = self.scenario.course(self.local, config.r_min)  # how far they are in its plan
         self.kernel = ffi.gc(kernel, lib.swarm_close)
         fault = lib.swarm_open(self.kernel)
         if fault:

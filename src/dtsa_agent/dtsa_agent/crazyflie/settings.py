@@ -22,7 +22,7 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting, settings_of
+from dtsa_agent.core.settings.declaration import REQUIRED, Settings, check, named, nested, setting, settings_of
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_agent.yaml_file import read_yaml
 
@@ -193,7 +193,7 @@ def parse_swarm(data: object) -> SwarmSettings:
     built = []
     for name, values in merged.items():
         with named(f"robots.{name}"):
-            built.append(build(RobotSettings, values | {"name": name}))
+            built.append(RobotSettings.from_dict(values | {"name": name}))
     owners: dict[int, str] = {}
     for robot in built:
         if owners.setdefault(robot.id, robot.name) != robot.name:

@@ -21,7 +21,9 @@ from .swarm_host import declare_swarm, host_agents
 _UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace
 
 CHANNEL = "channel"
-_AIR = Setting("air", "text", CHANNEL, "what carries the frames: the channel's node, or a port", words=(CHANNEL, *AIRS))
+_AIR = Setting(
+    "air", "text", CHANNEL, "what carries the frames: the channel's node, or a port", choices=(CHANNEL, *AIRS)
+)
 
 
 def _declare_identity(node: Node) -> tuple[int, str]:

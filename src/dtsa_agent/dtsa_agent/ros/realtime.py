@@ -30,7 +30,7 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core import station as core
 from dtsa_agent.core.agent import REFUSED
 from dtsa_agent.core.authentication import Authenticator
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, Scenario, generator
 from dtsa_agent.core.station import Link, Station, StationSettings
 from dtsa_agent.core.swarm import Presence

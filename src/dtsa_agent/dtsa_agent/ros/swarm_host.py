@@ -15,7 +15,7 @@ from rclpy.node import Node
 from dtsa_agent.air.port import ClockMap
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.settings.declaration import Setting, setting
 from dtsa_agent.keys import authenticator, with_key
 from dtsa_agent.priority import PrioritySettings, set_nice
@@ -84,7 +84,7 @@ def host_agents(
     :param spaces: namespace of each agent.
     :param shared: whether one table serves all.
     """
-    if shared and not can_share_table(config):
+    if shared and not config.may_share_table:
         raise ConfigError("shared_table", True, f"false with policy {config.policy}")
     host = HostSettings(**declare_settings(node, HostSettings))
     if host.mode == names.MODES[0]:

@@ -12,7 +12,7 @@ from slot_helpers import one_slot
 
 from dtsa_agent.core import ConfigError, LocalProtocolError, Swarm, SwarmConfig
 from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import VARIABLE, check_key, with_key
 
 KEY = bytes(range(32))

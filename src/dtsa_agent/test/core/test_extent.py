@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from frame_helpers import encode_extended
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core import ConfigError, Frame, Scenario, Swarm, SwarmConfig, decode_frame, encode_frame, make_scenario
-from dtsa_agent.core.frame import EXTENT_M, ExtendedFrame, Gossip, decode_extended, encode_extended, position_step
+from dtsa_agent.core.frame import EXTENT_M, ExtendedFrame, Gossip, decode_extended, position_step
 from dtsa_agent.core.settings.scenario import FIELD_MARGIN_M
 
 extents = st.one_of(st.just(EXTENT_M), st.floats(1.0, 10_000.0))

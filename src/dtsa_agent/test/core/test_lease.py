@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_helpers import encode_extended
 from lease_helpers import FAR, STATEMENTS, Air, is_anchor, make, still
 
 from dtsa_agent.core import REASONS, ConfigError, Scenario, Swarm, SwarmConfig, make_scenario
-from dtsa_agent.core.frame import OPEN, ExtendedFrame, Frame, Gossip, decode_extended, encode_extended
-from dtsa_agent.core.reference.lease.events import uses_open_turn
-from dtsa_agent.core.reference.lease.issue import open_block
-from dtsa_agent.core.reference.lease.memory import Memory
+from dtsa_agent.core.frame import OPEN, ExtendedFrame, Frame, Gossip, decode_extended
+from dtsa_agent.core.reference.lease import Memory, uses_open_turn
+from dtsa_agent.core.reference.lease_issue import open_block
 from dtsa_agent.core.reference.table import Rules
 
 OWN = {"position": (0.0, 0.0, 0.0), "velocity": (0.0, 0.0, 0.0), "intent": (0.0, 0.0, 0.0)}

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_helpers import encode_extended
 from lease_helpers import FAR, STATEMENTS, Air, is_anchor, make
 
-from dtsa_agent.core.frame import ExtendedFrame, Frame, encode_extended
+from dtsa_agent.core.frame import ExtendedFrame, Frame
 
 MAIN = 15  # K M of the default settings
 NOTHING = ExtendedFrame(Frame(1, 0, 0, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3))

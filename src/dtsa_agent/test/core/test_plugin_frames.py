@@ -10,7 +10,7 @@ import pytest
 
 from dtsa_agent.core import Agent, ConfigError, PluginError, SlotOutcome, Swarm, SwarmConfig
 from dtsa_agent.core.authentication import Authenticator
-from dtsa_agent.core.plugins.entry_points import Table, make_swarm
+from dtsa_agent.core.plugins import Table, make_swarm
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES
 
 KEY = bytes(range(16))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -11,13 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_helpers import encode_extended
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from kernel_parts import priority, select
 
 from dtsa_agent.core import REASONS, Frame, Swarm, SwarmConfig, decode_frame, encode_frame
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
-from dtsa_agent.core.frame import TAG_LENGTH, ExtendedFrame, Gossip, decode_extended, encode_extended, position_step
+from dtsa_agent.core.frame import TAG_LENGTH, ExtendedFrame, Gossip, decode_extended, position_step
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference import arithmetic, frame, policies
 from dtsa_agent.core.reference.frame import tag
@@ -63,11 +63,6 @@ def test_both_say_the_same_about_others(said: ExtendedFrame, extent: float) -> N
     assert outcome(lambda: encode_extended(said, extent)) == outcome(lambda: frame.encode_extended(said, step))
 
 
-def without_intent(heard: Frame, data: bytes) -> Frame:
-    """:func:`decode_frame` leaves the intent of an extended frame to :func:`decode_extended`."""
-    return dataclasses.replace(heard, intent=None) if data[0] == 0x12 else heard
-
-
 bodies = st.binary(max_size=8) | st.binary(min_size=18, max_size=23) | st.binary(min_size=54, max_size=57)
 heads = st.sampled_from([b"", b"\x10", b"\x11", b"\x12", b"\x13", b"\x22"])
 # Heads that are right, so that sections decide.
@@ -81,7 +76,7 @@ data_of |= sections.map(lambda given: b"\x12\x05\x03" + bytes([given[0] << 2]) +
 @example(b"\x12\1\2" + bytes(53))
 def test_both_understand_the_same(data: bytes) -> None:
     step = position_step(EXTENTS[0])
-    assert outcome(lambda: decode_frame(data)) == outcome(lambda: without_intent(frame.decode(data, step), data))
+    assert outcome(lambda: decode_frame(data)) == outcome(lambda: frame.decode(data, step))
     assert outcome(lambda: decode_extended(data)) == outcome(lambda: frame.decode_extended(data, step))
 
 

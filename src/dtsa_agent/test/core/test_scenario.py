@@ -173,13 +173,14 @@ def test_stop_and_go_shuttles_and_ends_where_the_number_of_legs_leads() -> None:
         assert np.array_equal(made.target, made.start) == home
         assert made.plan is not None
         line = np.linalg.norm(made.plan.goals[0] - made.start, axis=0)
-        assert np.allclose(made.plan.path_length, (stops + 1) * line)
+        assert np.allclose(made.path_length, (stops + 1) * line)
 
 
-def plan(legs: int, begin: int = 0, pause: int = 0) -> Plan:
+def one_agent(legs: int, begin: int = 0, pause: int = 0) -> Scenario:
     goals = np.zeros((legs, 3, 1))
     goals[:, 0, 0] = np.arange(1, legs + 1)
-    return Plan(np.zeros((3, 1)), goals, np.array([begin]), np.array([pause]), np.array([True]), 0.3)
+    plan = Plan(goals, np.array([begin]), np.array([pause]))
+    return Scenario(np.zeros((3, 1)), goals[-1], np.array([True]), plan)
 
 
 def advance(course: Course, slot: int, position: np.ndarray) -> bool:
@@ -187,7 +188,8 @@ def advance(course: Course, slot: int, position: np.ndarray) -> bool:
 
 
 def test_an_agent_rests_at_its_goals_and_then_goes_on() -> None:
-    course = Course(plan(3, begin=5, pause=4), np.array([0], dtype=np.int32))
+    course = one_agent(3, begin=5, pause=4).course(np.array([0], dtype=np.int32), r_min=0.3)
+    assert course is not None
     legs = []
     for slot in range(30):
         # It needs three slots to a goal, and is pushed out of it for one slot while it rests.
@@ -205,8 +207,8 @@ def test_an_agent_rests_at_its_goals_and_then_goes_on() -> None:
 def test_each_agent_alone_computes_what_all_together_compute() -> None:
     made = scenario(scenario="stop-and-go", agents=6, pause_slots=20, seed=1)
     assert made.plan is not None
-    together = made.course(np.arange(6, dtype=np.int32))
-    alone = [made.course(np.array([k], dtype=np.int32)) for k in range(6)]
+    together = made.course(np.arange(6, dtype=np.int32), r_min=0.3)
+    alone = [made.course(np.array([k], dtype=np.int32), r_min=0.3) for k in range(6)]
     assert together is not None
     random = np.random.default_rng(0)
     for slot in range(200):

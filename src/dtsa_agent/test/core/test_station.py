@@ -14,6 +14,7 @@ from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference import datagram
+from dtsa_agent.core.reference.frame import PROFILE_EXTENDED, PROFILE_PAPER
 from dtsa_agent.core.reference.table import Rules
 from dtsa_agent.core.station import STATES, VERDICTS, HoverReason, Link, Named, Station, StationSettings
 
@@ -48,7 +49,7 @@ def read_plainly(data: bytes, policy: str, link: Link, is_signed: bool) -> Any:
     """What the other statement reads in a datagram."""
     c, key = config_of(policy), KEY if is_signed else b""
     rules = Rules(
-        agents=5, slot_s=0.01, policy=policy, profile="extended" if policy == "lease" else "paper",
+        agents=5, slot_s=0.01, policy=policy, profile=PROFILE_EXTENDED if policy == "lease" else PROFILE_PAPER,
         anchor_every=c.anchor_every, main_every=c.main_every, open_every=c.open_period,
     )  # fmt: skip
     fields = datagram.Link(link.header, link.says_late, link.names, link.flight_ns, link.trust_ns)

@@ -10,7 +10,7 @@ from slot_helpers import one_slot
 
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
-from dtsa_agent.core.plugins.entry_points import PluginSwarm
+from dtsa_agent.core.plugins import PluginSwarm
 from dtsa_agent.core.settings.flight_models import VehicleParams
 from dtsa_agent.crazyflie.node.agents_node import HOLD_GAIN, HOLD_MPS, steer, ways_apart
 

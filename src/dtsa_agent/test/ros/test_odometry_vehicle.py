@@ -18,7 +18,7 @@ from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, rotate
 
 AGENT = "dtsa_agent.ros.agent_node"

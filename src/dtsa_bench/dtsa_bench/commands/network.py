@@ -77,7 +77,7 @@ def _read_file(args: argparse.Namespace) -> None:
     """Settings of the file stand for options that were not given; an error names both."""
     path = args.swarm_file
     values = {} if path is None else _content(path)
-    carriers = Setting("air", "text", None, "what carries the frames", words=AIRS)
+    carriers = Setting("air", "text", None, "what carries the frames", choices=AIRS)
     air = values.pop("air", AIRS[0])
     args.air = args.air or carriers.check(air, f"air in {path}")
     sections: dict[str, type[Settings]] = {"swarm": SwarmConfig, "port": settings_class(args.air), "own": AgentSettings}

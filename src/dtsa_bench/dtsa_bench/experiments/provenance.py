@@ -16,11 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.core.registry import ESTIMATORS, POLICIES, Registry
-from dtsa_agent.core.settings.flight_models import AVOIDERS
+from dtsa_agent.core.settings.config import REGISTRIES
 
 PROJECT = ("dtsa_agent", "dtsa_channel_sim", "dtsa_bench")
-_REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in (POLICIES, ESTIMATORS, AVOIDERS)}
 _HERE = Path(__file__).resolve().parent
 
 
@@ -41,7 +39,7 @@ def code_digest(plug_ins: frozenset[tuple[str, str]] = frozenset()) -> str:
 
 def _modules_of(kind: str, name: str) -> set[str]:
     """Top-level modules of a plug-in's distribution; builders other than setuptools list its files alone."""
-    registry = _REGISTRIES[kind]
+    registry = REGISTRIES[kind]
     modules = {registry.factory(name).__module__}
     installed = None if name in registry.registered else registry.plug_ins()[name].dist
     if installed is not None:

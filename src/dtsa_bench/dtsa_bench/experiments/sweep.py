@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import SETTING_NAMES, ConfigError
-from dtsa_agent.core.plugins.entry_points import list_plugins
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Setting, Settings, check, setting, settings_of
@@ -115,7 +114,7 @@ class Sweep:
     @cached_property
     def batch(self) -> Batch:
         """The runs, with the plug-ins that they name."""
-        named = {named for cell in self.cells for named in list_plugins(cell.run(self.seeds[0]).swarm)}
+        named = {named for cell in self.cells for named in cell.run(self.seeds[0]).swarm.plug_ins}
         return Batch(self.name, self.tasks, fly, frozenset(named))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Swarm, SwarmConfig, make_scenario
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_bench.runs.config import REALTIME, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_channel_sim import ChannelConfig

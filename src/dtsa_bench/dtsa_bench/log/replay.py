@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core import AgentGroup, Scenario, make_scenario
 from dtsa_agent.core.errors import RemoteProtocolError
 from dtsa_agent.core.frame import TAG_LENGTH, decode_extended
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.delivery import DeliveryCounts

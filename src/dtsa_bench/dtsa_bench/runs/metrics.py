@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm
 from dtsa_agent.core.kernel import ffi, lib, memory
-from dtsa_agent.core.plugins.entry_points import can_share_table, make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
@@ -54,7 +54,7 @@ def may_share(run: RunConfig) -> bool:
     """
     air, longest_ns = run.air, run.air.airtime.total_ns(run.air.airtime.longest)
     is_lossless = not any(getattr(air, name) for name in _LOSSES) and longest_ns <= air.slot_ns
-    return is_lossless and can_share_table(run.swarm)
+    return is_lossless and run.swarm.may_share_table
 
 
 class FlightMetrics:
@@ -80,7 +80,7 @@ class FlightMetrics:
         self.woken = np.full(agents, -1, dtype=np.int64)  # (N,) slot in which each that flies got its goal; -1: stands
         self._heard = np.zeros(agents, dtype=np.uint8)  # whether any agent has heard it since
         self._delays = np.zeros(_DELAYS, dtype=np.int64)
-        self._course = scenario.course(np.arange(agents, dtype=np.int32))
+        self._course = scenario.course(np.arange(agents, dtype=np.int32), swarm.r_min)
         target = np.array(scenario.target, dtype=np.float64)
         arrays = {
             "path": self._path, "last_position": self._last, "target": target, "goal": target.copy(),
@@ -214,7 +214,7 @@ class FlightMetrics:
         if plan is not None and len(plan.goals) > 1:
             if self.completion_slot < 0:
                 return {}
-            direct = plan.path_length
+            direct = self.scenario.path_length
         else:
             direct = np.sqrt(((self._last - self.scenario.start) ** 2).sum(axis=0))
         return {int(k) + 1: float(direct[k] / path[k]) for k in np.flatnonzero(self._moving) if path[k] > 0.0}

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.kernel import lib
-from dtsa_agent.core.plugins.entry_points import PluginSwarm, Table
+from dtsa_agent.core.plugins import PluginSwarm, Table
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS
 from dtsa_agent.core.settings.flight_models import AVOIDERS
 from dtsa_agent.keys import with_key

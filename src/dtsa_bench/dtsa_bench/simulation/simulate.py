@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario, Swarm, make_scenario
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics, may_share

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Swarm
 from dtsa_agent.core.errors import PluginError, shown
-from dtsa_agent.core.plugins.entry_points import PluginSwarm
-from dtsa_agent.core.plugins.guard import Guarded
+from dtsa_agent.core.plugins import Guarded, PluginSwarm
 from dtsa_channel_sim import Channel
 from dtsa_channel_sim.model.air import NEVER, Air
 from dtsa_channel_sim.model.medium import Positions

@@ -23,11 +23,12 @@ from waiting import wait_for
 pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_msgs.msg import Frame, Process, Report, Slot, Transmission
+from frame_helpers import encode_extended
 from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import Frame as OwnState
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.frame import ExtendedFrame, encode_extended
+from dtsa_agent.core.frame import ExtendedFrame
 from dtsa_agent.core.settings.config import agreed_settings, settings_hash
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.messages import header_of

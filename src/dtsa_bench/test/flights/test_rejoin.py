@@ -15,7 +15,7 @@ from fly_helpers import PATIENCE_S, FlightProcess, process_with, start_flight, s
 
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import decode_extended
-from dtsa_agent.core.reference.lease.memory import Memory
+from dtsa_agent.core.reference.lease import Memory
 from dtsa_agent.core.reference.table import Rules
 from dtsa_bench.log.record import load_log
 from dtsa_bench.runs.config import RunConfig, RunLimits

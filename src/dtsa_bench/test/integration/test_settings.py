@@ -182,10 +182,6 @@ def test_bags_of_before_are_read() -> None:
     assert isinstance(run.swarm.slot_ms, float)
 
 
-def words() -> tuple[str, ...]:
-    return ("red", "green")
-
-
 def make(name: str, **fields: tuple[str, Any]) -> type[Settings]:
     spec = {key: kind for key, (kind, _) in fields.items()}
     body = {key: default for key, (_, default) in fields.items()} | {"__annotations__": spec}
@@ -196,7 +192,7 @@ PART = make("Part", size=("float", setting(1.0, "size", unit="m", minimum=0, max
 WHOLE = make(
     "Whole", count=("int", setting(REQUIRED, "count", minimum=1, maximum=9)),
     share=("float", setting(0.5, "share", minimum=0, maximum=1)), on=("bool", setting(True, "on")),
-    color=("str", setting("red", "color", choices=words)),
+    color=("str", setting("red", "color", choices=("red", "green"))),
     plug=("str", setting("a", "plug", choices=("a", "b"), open_choices=True)),
     place=("Vector", setting((0.0, 0.0, 0.0), "place", unit="m")),
     level=("int | None", setting(None, "level", minimum=0, maximum=3)),

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 import dtsa
-from dtsa_agent.core import REASONS, Agent, ConfigError, PluginError, SwarmConfig, plug_in_random
-from dtsa_agent.core.plugins import entry_points as plugins
+from dtsa_agent.core import REASONS, Agent, ConfigError, PluginError, SwarmConfig, plug_in_random, plugins
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.flight_models import flight_model
 from dtsa_bench.commands.cli import main

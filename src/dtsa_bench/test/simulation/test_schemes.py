@@ -14,7 +14,7 @@ from dtsa_dev.protocol.optimum import optimum
 import dtsa
 from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
 from dtsa_agent.core.errors import PluginError
-from dtsa_agent.core.plugins.entry_points import Table, make_swarm
+from dtsa_agent.core.plugins import Table, make_swarm
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings import GroundStationSettings, SwarmSettings
 from dtsa_agent.stop import Stop

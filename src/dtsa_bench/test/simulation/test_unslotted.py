@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core.errors import PluginError
-from dtsa_agent.core.plugins.guard import Guarded
+from dtsa_agent.core.plugins import Guarded
 from dtsa_bench.simulation.unslotted import ListeningRadios
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 from dtsa_channel_sim.model.air import NEVER

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, build, check, setting, settings_of
+from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, check, setting, settings_of
 
 from .airtime import RADIOS, Airtime, airtime_of
 from .draws import CLOCK, generator
@@ -142,7 +142,7 @@ class ChannelConfig(Settings):
             if "slot_ns" in values:
                 raise ConfigError("slot_ms", values["slot_ms"], "either slot_ms or slot_ns, not both")
             values["slot_ns"] = round(_SLOT_MS.check(values.pop("slot_ms")) * 1_000_000)
-        return build(cls, values)
+        return super(ChannelConfig, cls).from_dict(values)
 
     @classmethod
     def from_yaml(cls, path: str | Path, **overrides: Any) -> ChannelConfig:

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from .frame import LENGTHS, TAG_LENGTH, Refused, decode, sender_and_slot, tag
-from .table import PROFILES, Rules
+from dtsa_agent.core.frame import named_in
+
+from .frame import LENGTHS, TAG_LENGTH, Refused, decode, tag
+from .table import Rules
 
 ACCEPTED, NOT_OURS, WRONG_LENGTH, OTHER_SETTINGS, NO_FRAME, UNKNOWN_AGENT = range(6)
 REJECTED, REPEATED, OTHER_TIME, SAME_ID, TOO_EARLY = range(6, 11)  # what became of a datagram
@@ -69,10 +71,10 @@ def parse_datagram(data: bytes, c: Settings, rules: Rules) -> Parsed | int:
         return WRONG_LENGTH
     if data[:agreed] != link.header:
         return OTHER_SETTINGS
-    if len(data) != head + LENGTHS[PROFILES.index(rules.profile)] + (TAG_LENGTH if c.key else 0):
+    if len(data) != head + LENGTHS[rules.profile] + (TAG_LENGTH if c.key else 0):
         return WRONG_LENGTH
     times, frame = data[agreed:head], data[head:]
-    named = sender_and_slot(frame)
+    named = named_in(frame)
     if named is None:
         return NO_FRAME
     sender, slot = named

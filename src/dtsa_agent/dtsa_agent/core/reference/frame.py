@@ -1,21 +1,7 @@
-"""The radio frame, bit by bit.
+"""The radio frame, bit by bit. The tables of its bytes: docs/reference/protocol.md#frames.
 
-Little-endian; the layout is docs/reference/protocol.md's table::
-
-    0      version (high nibble), profile (low nibble)
-    1-2    sender's id
-    3      c_r
-    4-7    slot in which the state was sampled
-    8-13   position, 3 x 16 bits, in steps that the swarm agrees on (2 mm)
-    14-18  velocity, 3 x 12 bits, 1 cm/s, 4 bits zero          (profile paper, 19 bytes)
-    14-22  velocity and commanded velocity, 6 x 12 bits, 1 cm/s (profile paper with intent, 23 bytes)
-
-Profile extended (56 bytes) has these 23 bytes, but for 1 to 3, and three sections about others::
-
-    1      sender's id, 1..254
-    2      c_s, 0..253; 255: the sender leaves with this frame
-    3      bit 0: c_r is not 0; bit 1: in probation; bits 2-3, 4-5, 6-7: kinds of the three sections
-    23-33, 34-44, 45-55   sections: leases first, then a relay, what is handed on far ahead, then gossip
+Little-endian. Profile paper has 19 bytes, with intent 23; profile extended has these 23, with other bytes 1 to 3, and
+three sections about others, leases first, then a relay, what is handed on far ahead, then gossip: 56.
 """
 
 from __future__ import annotations
@@ -125,14 +111,6 @@ def decode(data: bytes, position_step: float) -> Frame:
     (position,) = scaled_vectors(steps[:3], 16, position_step)
     velocity, intent = scaled_vectors(steps[3:], 12, VELOCITY_STEP)
     return Frame(sender, slot, c_r, position, velocity, None if profile == PROFILE_PAPER else intent)
-
-
-def sender_and_slot(data: bytes) -> tuple[int, int] | None:
-    """The sender's id and the slot that some bytes name, before they are decoded; None: they cannot be a frame."""
-    if len(data) < 8 or data[0] >> 4 != VERSION or data[0] & 0xF not in LENGTHS:
-        return None
-    _, _, sender, _, slot = unpack(data, OWN_BITS[:5])
-    return data[1] if data[0] & 0xF == PROFILE_EXTENDED else sender, slot
 
 
 def condition_of(data: bytes) -> tuple[bool, bool, bool]:

@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from . import estimators
 from .arithmetic import INVERSE_PI, Vector, arcsin, dot, minus, mix64, share_of, sum_in_lanes
-from .table import Rules, Table
+from .table import Table, intent, linear
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,18 +25,21 @@ NOBODY = Choice(-1, "nobody")
 STRAIGHT = 0.02  # m/s, weight of an agent that flies straight on, with policy innovation
 
 
-def choose(table: Table, slot: int, rules: Rules) -> Choice:
+def choose(table: Table, slot: int) -> Choice:
     """Whose turn a slot is in the eyes of one table: the same for all agents whose tables are the same.
 
     ``tdma`` gives all the same update time (eq:update_time_tdma), ``age`` all of A_p (eq:update_time_NA).
     """
+    rules = table.rules
     if rules.policy == "tdma":
         return Choice(slot % rules.agents, "tdma")
     if rules.policy == "dtsa" and rules.boot_round and slot < rules.agents:
         return Choice(slot, "boot")
-    outside = choose_outside(table, slot, rules)
+    outside = choose_outside(table, slot)
     if outside is not None:
         return outside
+    if rules.policy == "aloha":
+        return choose_aloha(table, slot)
     members = [k for k, row in enumerate(table.rows) if row.in_ap]
     h = [row.h(slot) for row in table.rows]
     longest = oldest(h, members)
@@ -50,35 +52,35 @@ def choose(table: Table, slot: int, rules: Rules) -> Choice:
     if rules.policy == "innovation":
         weighed = max(members, key=lambda k: h[k] * (STRAIGHT + table.rows[k].innovation))
         return Choice(weighed, "innovation", counters=h)
-    return choose_by_priority(table, slot, h, rules)
+    return choose_by_priority(table, slot, h)
 
 
-def choose_by_priority(table: Table, slot: int, h: list[int], rules: Rules) -> Choice:
+def choose_by_priority(table: Table, slot: int, h: list[int]) -> Choice:
     """The agent of A_p with the most urgent extrapolated state (eq:estimate, eq:permission_d_p_ang, eq:pfs)."""
-    estimate = estimators.intent if rules.estimator == "intent" else estimators.linear
+    rules = table.rules
+    estimate = intent if rules.estimator == "intent" else linear
     believed = [estimate(row, rules, slot) for row in table.rows]
     g = priorities([p for p, _ in believed], [v for _, v in believed], rules.slot_s)
     choice = select(g, h, [row.in_ap for row in table.rows], rules.epsilon, rules.selection)
     return replace(choice, counters=h, priorities=g)
 
 
-def choose_outside(table: Table, slot: int, rules: Rules) -> Choice | None:
+def choose_outside(table: Table, slot: int) -> Choice | None:
     """Every so many slots one belongs, in id order, to the agents outside A_p; None: this is no such slot."""
-    if rules.return_every < 1 or slot % rules.return_every != rules.return_every - 1:
+    every = table.rules.return_every
+    if every < 1 or slot % every != every - 1:
         return None
     outside = [k for k, row in enumerate(table.rows) if not row.in_ap]
     if not outside:
         return None
-    return Choice(outside[slot // rules.return_every % len(outside)], "return")
+    return Choice(outside[slot // every % len(outside)], "return")
 
 
-def choose_aloha(table: Table, slot: int, agent: int, rules: Rules) -> Choice:
+def choose_aloha(table: Table, slot: int) -> Choice:
     """ALOHA: each agent of A_p sends with probability 1 / N_p, by a draw that depends on key, slot and id only."""
-    outside = choose_outside(table, slot, rules)
-    if outside is not None:
-        return outside
+    agent = table.observer
     members = sum(row.in_ap for row in table.rows)
-    draw = share_of(mix64(rules.key ^ mix64(slot * 65536 + agent)))
+    draw = share_of(mix64(table.rules.key ^ mix64(slot * 65536 + agent)))
     sends = table.rows[agent - 1].in_ap and draw * members < 1.0
     return Choice(agent - 1 if sends else -1, "random")
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from .agent import Agent, Foreign, hear, parse
+from .agent import Agent, Foreign, parse
 from .arithmetic import mix64
 from .datagram import (
     ACCEPTED,
@@ -304,7 +304,7 @@ class Station:
         try:
             parsed, sampled = parse(frame, slot, self.rules)
             if self.agent.present:
-                hear([self.agent], parsed, sampled, self.rules)
+                self.agent.hear(parsed, sampled)
         except (Refused, Foreign):
             pass
         if self.awaits and slot >= self.slot:

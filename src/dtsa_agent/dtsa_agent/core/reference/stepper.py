@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.core.frame import position_step
-from dtsa_agent.core.registry import PROFILES, REASONS
+from dtsa_agent.core.registry import REASONS
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.flight_models import flight_model
 from dtsa_agent.core.settings.scenario import Scenario, policy_key
 from dtsa_agent.core.swarm import Bytes, Swarm
 
-from .agent import Agent, Foreign, hear, parse
+from .agent import Agent, Foreign, parse
 from .arithmetic import Vector
-from .estimators import ESTIMATORS
-from .lease.memory import DEAF
-from .table import Rules, Table
+from .lease import DEAF
+from .table import ESTIMATORS, Rules, Table
 
 
 def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
@@ -32,7 +31,6 @@ def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
     same = {field.name: getattr(config, field.name) for field in fields(Rules) if hasattr(config, field.name)}
     return Rules(**{
         **same, "tau": flight_model(config.avoider, config.options).vehicle.tau, "key": policy_key(config.seed),
-        "profile": PROFILES[config.profile],
         "position_step": position_step(config.extent_m), "open_every": config.open_period,
         "targets_known": config.targets_known and scenario.goals_known,
     })  # fmt: skip
@@ -50,9 +48,7 @@ class ReferenceSwarm(Swarm):
         super().__init__(config, scenario, local)
         self.rules = rules_of(config, self.scenario)
         start = _vectors(self.scenario.start)
-        by_innovation = config.policy == "innovation"
-        tables = [Table(int(k) + 1, start, by_innovation=by_innovation) for k in self.local]
-        self.agents = [Agent(table.observer - 1, self.rules, table) for table in tables]
+        self.agents = [Agent(Table(agent, self.rules, start)) for agent in self.ids]
         for place in range(len(self.agents)):
             self._publish(place)
 
@@ -101,15 +97,12 @@ class ReferenceSwarm(Swarm):
             self.rejects[int(isinstance(error, Foreign))] += 1
             return False
         self._read_arrays()
-        extended = self.config.extended
-        reached = [
-            place
-            for place, agent in enumerate(self.agents)
-            if (mask is None or mask[place])
-            and not (extended and (agent.index + 1 == frame.own.sender or not (agent.present or self.shares)))
-        ]
-        hear([self.agents[place] for place in reached], frame, sampled, self.rules)
-        for place in reached:
+        for place, agent in enumerate(self.agents):
+            if mask is not None and not mask[place]:
+                continue
+            if self.config.extended and (agent.index + 1 == frame.own.sender or not (agent.present or self.shares)):
+                continue
+            agent.hear(frame, sampled)
             self._publish(place)
         return True
 

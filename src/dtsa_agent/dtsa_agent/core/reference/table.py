@@ -1,17 +1,22 @@
-"""The settings that all agents share, and what one observer believes about all of them: one row an agent."""
+"""The settings that all agents share, and what one observer believes about all of them: one row an agent.
+
+Extended frames carry gossip, what their sender last heard of others. Where an agent is by now: eq:estimate.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
-from dtsa_agent.core.frame import Frame
+from dtsa_agent.core.frame import Frame, Gossip
 
 from .arithmetic import ZERO, Vector, bits_of, minus, mix64, norm1
+from .frame import GOSSIP_AGE_MAX, PROFILE_PAPER, SECTIONS, gossip_fits
 
 OFF, ON, LEAVES = 0, 1, 2  # of an agent: not there, there, about to be switched off
-PROFILES = PAPER, PAPER_INTENT, EXTENDED = "paper", "paper-intent", "extended"  # of frames
+DECAY_STEPS = 4096  # beyond this many control periods a vehicle has settled at its command
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +36,7 @@ class Rules:
     boot_round: bool = True
     return_every: int = 20
     # frames
-    profile: str = PAPER
+    profile: int = PROFILE_PAPER
     position_step: float = 0.002  # m
     r_min: float = 0.3  # m, eq:remaining_t_slots
     c_r: int = 1  # C, eq:remaining_t_slots
@@ -84,14 +89,14 @@ class Row:
 class Table:
     """What one observer knows.
 
+    :param observer: its id.
     :param known_goals: where those that rest are taken to stand, m; None: nobody knows that.
-    :param by_innovation: decisions depend on the innovation, too, so digests do.
     """
 
     observer: int
+    rules: Rules
     start: Sequence[Vector]
     known_goals: Sequence[Vector] | None = None
-    by_innovation: bool = False
     rows: list[Row] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -125,6 +130,45 @@ class Table:
             row.last_turn = slot
             self._digest_row(index)
 
+    def collect_gossip(self, slot: int, room: int) -> tuple[Gossip, ...]:
+        """The states that a frame carries: the newest, the newest of k slots or more, and of 2 k; k = 2 + N div 16.
+
+        The first mends single losses at once; the others reach receivers that heard nothing for a while. What is left
+        of the room carries the next newest.
+        """
+        later = 2 + self.rules.agents // 16
+        chosen: list[int] = []
+        for age in (1, later, 2 * later, *[1] * SECTIONS):
+            if len(chosen) < room:
+                chosen += self._newest_of_age(slot, age, chosen)
+        rows = [(k, self.rows[k]) for k in chosen]
+        return tuple(Gossip(k + 1, slot - row.sent_slot, row.in_ap, row.position, row.velocity) for k, row in rows)
+
+    def _newest_of_age(self, slot: int, age: int, chosen: list[int]) -> list[int]:
+        """The newest state of an agent not yet chosen that is ``age`` slots old or older and can be said; or none."""
+        fit = [
+            k
+            for k, row in enumerate(self.rows)
+            if k != self.observer - 1
+            and row.sent_slot >= 0
+            and age <= slot - row.sent_slot <= GOSSIP_AGE_MAX
+            and k not in chosen
+            and gossip_fits(row.position, row.velocity, self.rules.position_step)
+        ]
+        return [max(fit, key=lambda k: self.rows[k].sent_slot)] if fit else []
+
+    def learn_gossip(self, entry: Gossip, sampled: int) -> None:
+        """A state that another agent heard replaces an older one only.
+
+        One at the codec's limit may be a wrong one and is not believed. The observer's entry for itself counts only
+        where that confirms that it was heard (:func:`.lease.hear_gossip`).
+        """
+        if sampled < 0 or self.rows[entry.agent - 1].sent_slot >= sampled:
+            return
+        if gossip_fits(entry.position, entry.velocity, self.rules.position_step):
+            velocity = entry.velocity
+            self.learn(Frame(entry.agent, sampled, int(entry.moving), entry.position, velocity, velocity), sampled)
+
     @property
     def digest(self) -> int:
         """32 bits over everything that decisions depend on: equal digests, equal tables."""
@@ -142,6 +186,60 @@ class Table:
         for axis in range(3):
             x = mix64(x ^ bits_of(row.position[axis]))
             x = mix64(x ^ bits_of(row.velocity[axis]))
-        if self.by_innovation:
+        if self.rules.policy == "innovation":  # decisions depend on it
             x = mix64(x ^ bits_of(row.innovation))
         row.digest = (x ^ x >> 32) & 0xFFFFFFFF
+
+
+def age_s(row: Row, rules: Rules, slot: int, step: int = 0) -> float:
+    """Age of a known state, (i - m) t_s in eq:estimate, s; 0 for an agent never heard of."""
+    return 0.0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.slot_s + step * rules.dt
+
+
+def hold(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Vector]:
+    """Position and velocity as last heard."""
+    return row.position, row.velocity
+
+
+def linear(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Vector]:
+    """On with the velocity last heard: p + (i - m) t_s v (eq:estimate)."""
+    age, p, v = age_s(row, rules, slot, step), row.position, row.velocity
+    return (p[0] + v[0] * age, p[1] + v[1] * age, p[2] + v[2] * age), v
+
+
+def intent(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Vector]:
+    """Towards the commanded velocity c, as an unsaturated vehicle answers it.
+
+    After k control periods: velocity c + (v - c) q^k, position p + c a + (v - c) dt (q + .. + q^k).
+    """
+    age = age_s(row, rules, slot, step)
+    ago = 0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.steps + step
+    powers, ways = decay_table(rules.tau, rules.dt)
+    ago = max(0, min(ago, DECAY_STEPS - 1))  # a frame of the next slot may be heard before this one is over
+    q, distance = powers[ago], ways[ago]
+    moved = []
+    for p, v, c in zip(row.position, row.velocity, row.intent, strict=True):
+        d = v - c
+        moved.append((p + c * age + d * distance, c + d * q))
+    (x, vx), (y, vy), (z, vz) = moved
+    return (x, y, z), (vx, vy, vz)
+
+
+@lru_cache(maxsize=8)
+def decay_table(tau: float, dt: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """How an unsaturated vehicle approaches its command: q^k (1), and dt (q + .. + q^k) (s), for k = 0, 1, ...
+
+    q = 1 - dt / tau is the vehicle's own integrator. By multiplication alone, so that all agents compute the same bits.
+    """
+    q = max(0.0, 1.0 - dt / tau)
+    powers, ways = [], []
+    power, distance = 1.0, 0.0
+    for _ in range(DECAY_STEPS):
+        powers.append(power)
+        ways.append(distance)
+        power *= q
+        distance += dt * power
+    return tuple(powers), tuple(ways)
+
+
+ESTIMATORS = {"hold": hold, "linear": linear, "intent": intent}  # the oracle knows the truth, there is nothing to state

@@ -30,7 +30,7 @@ SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
 MAX_AGENTS = 1024
 MOST_ROUNDS = 15  # from one anchor that nobody gives away to the next: so far lease bytes reach
 
-_REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
+REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in (POLICIES, ESTIMATORS, AVOIDERS)}
 _ACCEPTED: set[str] = set()  # options of plug-ins that did not fly: to look for those takes milliseconds
 
 
@@ -123,13 +123,13 @@ class SwarmConfig(Settings):
     def _check_plug_in_options(self) -> None:
         """Check that plug-ins declare the options with a dot, also those of plug-ins that do not fly."""
         for key in self.options:
-            owner = key.rpartition(".")[0]
-            flying = [r for r in _REGISTRIES if getattr(self, r.kind) == owner and owner not in r.rows]
+            owner, registries = key.rpartition(".")[0], REGISTRIES.values()
+            flying = [REGISTRIES[kind] for kind, name in self.plug_ins if name == owner]
             if not owner or (not flying and key in _ACCEPTED):
                 continue
-            owners = flying or [registry for registry in _REGISTRIES if owner in registry.plug_in_names()]
+            owners = flying or [registry for registry in registries if owner in registry.plug_in_names()]
             if not owners:
-                names = ", ".join(sorted({name for registry in _REGISTRIES for name in registry.plug_in_names()}))
+                names = ", ".join(sorted({name for registry in registries for name in registry.plug_in_names()}))
                 raise ConfigError("options", key, f"the name of a plug-in before the dot; {names}")
             declared = sorted(f"{owner}.{word}" for r in owners for word in _declared(owner, r.factory(owner)))
             if key not in declared:
@@ -159,6 +159,17 @@ class SwarmConfig(Settings):
         """Numbers (from 1) of the places at which the agents begin, by id; empty: not said."""
         words = self.places.replace(",", " ").split()
         return [int(word) if word.isascii() and word.isdigit() else 0 for word in words]
+
+    @property
+    def plug_ins(self) -> list[tuple[str, str]]:
+        """Kind and name of each part that is not built in."""
+        names = {kind: str(getattr(self, kind)) for kind in REGISTRIES}
+        return [(kind, name) for kind, name in names.items() if name not in REGISTRIES[kind].rows]
+
+    @property
+    def may_share_table(self) -> bool:
+        """Whether agents of one process may share a table for as long as all of them receive the same frames."""
+        return self.policy_row.may_share and not self.plug_ins
 
     @property
     def own_bytes(self) -> int:

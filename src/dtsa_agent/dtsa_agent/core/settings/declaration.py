@@ -28,7 +28,6 @@ _WORDS = {
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _BOOLS = {**dict.fromkeys(("true", "yes", "on", "1"), True), **dict.fromkeys(("false", "no", "off", "0"), False)}
 
-Choices = tuple[Any, ...] | Callable[[], tuple[Any, ...]]
 T = TypeVar("T", bound="Settings")
 
 
@@ -43,7 +42,7 @@ class Setting:
     unit: str = ""  # of the numbers; empty or "1": none
     minimum: float | None = None  # smallest number allowed
     maximum: float | None = None
-    words: Choices = ()  # the values allowed, or a function that gives them; empty: any of the kind and the range
+    choices: tuple[Any, ...] = ()  # the values allowed; empty: any of the kind and the range
     open_choices: bool = False  # other words are allowed too: they name plug-ins
     required: bool = False  # there is no default
     optional: bool = False  # None is allowed: the value then follows from the other settings
@@ -51,11 +50,6 @@ class Setting:
     custom: bool = False  # the settings class checks it itself
     section: type[Settings] | None = None  # the settings class of a nested section
     group: str = ""  # heading under which the documentation lists it, and those that follow
-
-    @property
-    def choices(self) -> tuple[Any, ...]:
-        """The values allowed, those of plug-ins apart; empty: any value of the kind and the range."""
-        return self.words() if callable(self.words) else self.words
 
     @property
     def description(self) -> str:
@@ -103,7 +97,7 @@ class Setting:
         """
         if value is None and self.optional:
             return None
-        name, words = name or self.name, self.choices
+        name = name or self.name
         if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
             value = value.item()
         if self.kind == "values":
@@ -118,7 +112,7 @@ class Setting:
             low, high = (value if bound is None else bound for bound in (self.minimum, self.maximum))
             if not (_is_finite(value) and low <= value <= high):
                 raise ConfigError(name, value, self._number_range or self.allowed)
-        if words and not self.open_choices and value not in words:
+        if self.choices and not self.open_choices and value not in self.choices:
             raise ConfigError(name, value, self.allowed)
         return _KEPT[self.kind](value) if self.kind in _KEPT else value
 
@@ -139,7 +133,7 @@ class Setting:
 
 def setting(
     default: Any, help: str, unit: str = "", minimum: float | None = None, maximum: float | None = None, *,
-    kind: str = "", choices: Choices = (), **more: Any,
+    kind: str = "", choices: tuple[Any, ...] = (), **more: Any,
 ) -> Any:  # fmt: skip
     """A field of a settings class; without ``kind`` that of its annotation. ``more``: fields of :class:`Setting`."""
     metadata = {"setting": Setting("", kind, None, help, unit, minimum, maximum, choices, **more)}
@@ -209,24 +203,19 @@ class Settings:
 
         :raises ConfigError: for unknown names and values that are not allowed.
         """
-        return build(cls, values)
-
-
-def build(cls: type[T], values: Mapping[str, Any]) -> T:
-    """What :meth:`Settings.from_dict` does, for classes that read their values in a way of their own first."""
-    specs = {spec.name: spec for spec in settings_of(cls)}
-    arguments = dict(names_with_values(values, "settings"))
-    for name, value in arguments.items():
-        if name not in specs:
-            raise ConfigError(str(name), value, SETTING_NAMES + ", ".join(specs))
-        section = specs[name].section
-        if section and isinstance(value, Mapping):
-            with named(name):
-                arguments[name] = section.from_dict(value)
-    for spec in specs.values():
-        if spec.required and spec.name not in arguments:
-            raise ConfigError(spec.name, None, spec.allowed)
-    return cls(**arguments)
+        specs = {spec.name: spec for spec in settings_of(cls)}
+        arguments = dict(names_with_values(values, "settings"))
+        for name, value in arguments.items():
+            if name not in specs:
+                raise ConfigError(str(name), value, SETTING_NAMES + ", ".join(specs))
+            section = specs[name].section
+            if section and isinstance(value, Mapping):
+                with named(name):
+                    arguments[name] = section.from_dict(value)
+        for spec in specs.values():
+            if spec.required and spec.name not in arguments:
+                raise ConfigError(spec.name, None, spec.allowed)
+        return cls(**arguments)
 
 
 def check(config: Any) -> None:

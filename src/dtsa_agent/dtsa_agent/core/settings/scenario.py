@@ -47,40 +47,32 @@ def plug_in_random(config: SwarmConfig, agent: int, name: str) -> np.random.Gene
 class Plan:
     """The goals of all agents, known before the flight."""
 
-    start: Array  # (3, N), m, frame map: where each waits for its first slot
     goals: Array  # (K, 3, N), m: where each flies to, one after the other; the last one is its target
     begin: NDArray[np.int64]  # (N,) first slot in which each flies
     pause: NDArray[np.int64]  # (N,) slots that each rests at a goal before it flies on to the next
-    moving: NDArray[np.bool_]  # (N,) who flies at all
-    r_min: float  # m, closer than this an agent has arrived
-
-    @property
-    def path_length(self) -> Array:
-        """Length of the straight lines from goal to goal, (N,), m."""
-        points = np.concatenate((self.start[None], self.goals))
-        return np.asarray(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)).sum(axis=0))
 
 
 class Course:
-    """How far some agents, (L,) indices ``local``, are with their plans: the memory of ``swarm_advance``.
+    """How far some agents, (L,) indices ``local``, are with a scenario's plan: the memory of ``swarm_advance``.
 
     From the slot's number and an agent's own position alone: an agent runs this for itself, the simulator for all.
+    ``r_min``: m, closer than this an agent has arrived.
     """
 
-    def __init__(self, plan: Plan, local: NDArray[np.int32]) -> None:
-        self._start = plan.start[:, local]
+    def __init__(self, scenario: Scenario, plan: Plan, local: NDArray[np.int32], r_min: float) -> None:
+        self._start = scenario.start[:, local]
         self.leg = np.full(len(local), -1, dtype=np.int64)  # index of the present goal, -1: waits for its first slot
         self._since = self.leg.copy()  # slot of arrival at the present goal, -1: under lengths
         self.changed = self.leg.copy()  # slot in which that became its goal
         self.goal: Array = np.ascontiguousarray(self._start)  # (3, L) m, frame map, where each flies to now
         arrays = {
-            "local": np.array(local, dtype=np.int32), "start": np.ascontiguousarray(plan.start),
+            "local": np.array(local, dtype=np.int32), "start": np.ascontiguousarray(scenario.start),
             "goals": np.ascontiguousarray(plan.goals), "begin": np.array(plan.begin, dtype=np.int64),
-            "pause": np.array(plan.pause, dtype=np.int64), "moving": np.array(plan.moving, dtype=np.uint8),
+            "pause": np.array(plan.pause, dtype=np.int64), "moving": np.array(scenario.moving, dtype=np.uint8),
             "leg": self.leg, "since": self._since, "changed": self.changed, "goal": self.goal,
         }  # fmt: skip
         self._borrowed = {name: memory(array) for name, array in arrays.items()}
-        sizes = {"n": plan.start.shape[1], "count": len(local), "goal_count": len(plan.goals), "r_min": plan.r_min}
+        sizes = {"n": scenario.start.shape[1], "count": len(local), "goal_count": len(plan.goals), "r_min": r_min}
         self.kernel = ffi.new("course *", {**sizes, **self._borrowed})  # for swarm_advance
 
     def reset(self) -> None:
@@ -103,9 +95,16 @@ class Scenario:
     plan: Plan | None = None
     goals_known: bool = True  # all know where everybody wants to be in each slot
 
-    def course(self, local: NDArray[np.int32]) -> Course | None:
+    @property
+    def path_length(self) -> Array:
+        """Length of the straight lines from goal to goal, (N,), m."""
+        goals = self.target[None] if self.plan is None else self.plan.goals
+        points = np.concatenate((self.start[None], goals))
+        return np.asarray(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)).sum(axis=0))
+
+    def course(self, local: NDArray[np.int32], r_min: float) -> Course | None:
         """The state of a flight along the plan, of the agents with indices ``local``; None without a plan."""
-        return None if self.plan is None else Course(self.plan, local)
+        return None if self.plan is None else Course(self, self.plan, local, r_min)
 
     def advance(self, slot: int, swarm: Any) -> None:
         """Set goals and activity of a :class:`~dtsa_agent.core.swarm.Swarm` for the slot that is about to begin.
@@ -201,9 +200,8 @@ def _planned(config: SwarmConfig, plain: Scenario, random: np.random.Generator) 
         goals = np.stack([plain.target if leg % 2 == 0 else plain.start for leg in range(legs)])
         if config.pause_slots:
             begin[moving] = random.integers(0, config.pause_slots, int(moving.sum()))
-    plan = Plan(plain.start, np.ascontiguousarray(goals), begin, pause, moving, config.r_min)
     goals_known = config.scenario == "staggered"
-    return Scenario(plain.start, np.ascontiguousarray(goals[-1]), moving, plan, goals_known)
+    return Scenario(plain.start, np.ascontiguousarray(goals[-1]), moving, Plan(goals, begin, pause), goals_known)
 
 
 WAYPOINT_GAP = 0.9  # m, between a waypoint and everybody's last goal, and among the movers' n-th waypoints

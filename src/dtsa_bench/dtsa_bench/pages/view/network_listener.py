@@ -14,7 +14,7 @@ from dtsa_agent.air.port import PortSettings, frame_in, link_of, open_port
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import decode_extended
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.station import (
     EARLY_COUNT,
     OTHER_TIME,

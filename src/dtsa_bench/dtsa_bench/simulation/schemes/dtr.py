@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_agent.core.plugins import Table
 from dtsa_bench.simulation.unslotted import Radio
 
 _MOST_AGENTS = 20  # MAX_NETWORK_SIZE

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Swarm
-from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_agent.core.plugins import Table
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]

@@ -6,7 +6,7 @@ import numpy as np
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_agent.core.plugins import Table
 from dtsa_bench.simulation.unslotted import Radio
 from dtsa_channel_sim.model.airtime import Airtime
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_agent.core.plugins import Table
 from dtsa_agent.core.swarm import SlotOutcome
 
 from .knowledge import has_arrived

@@ -1,5 +1,5 @@
 /* Policy lease, the leases in a frame: turns that its sender gives away or hands on, and known
- * leases that it relays. The same in plain Python: core/reference/lease/issue.py. */
+ * leases that it relays. The same in plain Python: core/reference/lease_issue.py. */
 #include <math.h>
 #include <string.h>
 

@@ -1,51 +1,36 @@
-"""Policies, estimators and avoiders from other packages, found by entry point. See docs/reference/plug-ins.md.
+"""Policies, estimators and avoiders from other packages: made, checked, called. See docs/reference/plug-ins.md.
 
-A package declares them in its metadata::
-
-    [project.entry-points."dtsa.policies"]
-    reverse = "my_package:Reverse"
-
-and then ``policy="reverse"`` works everywhere: in `simulate`, `sweep` and in the nodes. The entry point is a factory,
-called once for every observer as ``factory(config, agent)`` (agent: its id, 0 for tables that hear everything). It
-returns an object with the methods that docs/reference/plug-ins.md lists.
+An error that a plug-in raises, or a wrong return value, becomes a PluginError with its name.
 """
 
 from __future__ import annotations
 
+import math
+import operator
+import traceback
 import weakref
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.frame import decode_frame
-from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS, Registry
-from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.settings.flight_models import AVOIDERS
-from dtsa_agent.core.settings.scenario import Scenario
-from dtsa_agent.core.swarm import Bytes, SlotOutcome, Swarm
-
-from .guard import Guarded
+from .errors import DtsaError, PluginError, shown
+from .frame import decode_frame
+from .registry import REASONS, Registry
+from .settings.config import REGISTRIES, SwarmConfig
+from .settings.scenario import Scenario
+from .swarm import Bytes, SlotOutcome, Swarm
 
 _PLUGIN_REASON = REASONS.index("plugin")
-_REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
-
-
-def uses_plugins(config: SwarmConfig) -> bool:
-    """Whether a configuration names anything that is not built in."""
-    return bool(list_plugins(config))
-
-
-def list_plugins(config: SwarmConfig) -> list[tuple[str, str]]:
-    """Return kind and name of each plug-in in a configuration."""
-    parts = ((registry, str(getattr(config, registry.kind))) for registry in _REGISTRIES)
-    return [(registry.kind, name) for registry, name in parts if name not in registry.rows]
-
-
-def can_share_table(config: SwarmConfig) -> bool:
-    """Whether the agents of one process may share a table for as long as all of them receive the same frames."""
-    return config.policy_row.may_share and not uses_plugins(config)
+# The method that a plug-in must have, by its kind; policies for comparison have another one instead.
+_REQUIRED = {
+    "policy": "choose(table, slot)",
+    "estimator": "estimate(table, slot, step, position, velocity)",
+    "avoider": "command(table, slot, step)",
+}
+_FOR_COMPARISON = ("senders(swarm, slot)", "wake(table, now_ns, radio)")
+_OWN_DATA = ["own_data(table, slot)", "receive_data(table, slot, sender, data)"]  # with `own_bytes`
 
 
 def make_swarm(
@@ -58,7 +43,7 @@ def make_swarm(
 
     :raises ConfigError: for ids and plug-ins that do not exist.
     """
-    if not uses_plugins(config):
+    if not config.plug_ins:
         return Swarm(config, scenario, local, shared_table, observers)
     return PluginSwarm(config, scenario, local, False, observers)
 
@@ -114,18 +99,19 @@ class PluginSwarm(Swarm):
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
-        self._ids = [int(index) + 1 for index in self.observer]
-        self.tables = [Table(self, row) for row in range(len(self._ids))]  # of each observer
-        self._outcome = np.zeros(len(self._ids), dtype=np.uint8)  # SlotOutcome of this slot, without collisions
+        self.tables = [Table(self, row) for row in range(len(self.observer))]  # of each observer
+        self._outcome = np.zeros(len(self.tables), dtype=np.uint8)  # SlotOutcome of this slot, without collisions
         self._appended: dict[int, bytes] = {}  # own data of this slot's frames, by position in ids
         self._own_bytes = self.config.own_bytes
         self._make_parts()
 
     def _make_parts(self) -> None:
         has_genie = self.config.policy_row.needs_everybody and bool(self.ids)
-        self._genie = self._make_part(POLICIES, 0) if has_genie else None
+        self._genie = self._make_part(REGISTRIES["policy"], 0) if has_genie else None
         #: Plug-ins of each observer; empty if the part is built in, or the policy is a genie.
-        self.policies, self.estimators, self.avoiders = (self._make_instances(r, self._ids) for r in _REGISTRIES)
+        self.policies, self.estimators, self.avoiders = (
+            self._make_instances(registry, [table.agent for table in self.tables]) for registry in REGISTRIES.values()
+        )
         self.flies_in_c = not (self.estimators or self.avoiders)
         self._list_data_parts()
 
@@ -144,7 +130,7 @@ class PluginSwarm(Swarm):
         policy, estimator = self.config.policy_row, self.config.estimator_row
         parts = ((self.policies, policy.own_bytes), (self.estimators, estimator.own_bytes))
         self._data_parts = [
-            [(instances[row], size) for instances, size in parts if instances] for row in range(len(self._ids))
+            [(instances[row], size) for instances, size in parts if instances] for row in range(len(self.tables))
         ]
         self._needs_outcome = any(hasattr(part, "slot_over") for row in self._data_parts for part, _ in row)
 
@@ -158,7 +144,8 @@ class PluginSwarm(Swarm):
             self.estimate(slot)  # for the slot's start; those of control instants and metrics depend on the vehicle
             for index, agent in enumerate(self.ids):
                 policy = self.policies[index]
-                chosen = policy.check_choice(policy.choose(self.tables[index], slot), slot, self.config.agents)
+                choice = policy.choose(self.tables[index], slot)
+                chosen = policy.check_id(choice, "choose", slot, 0, self.config.agents)
                 self.chosen[index], self.sends[index] = chosen, chosen == agent and self.present[index]
         else:
             super().decide(slot)
@@ -188,14 +175,14 @@ class PluginSwarm(Swarm):
         if not (self._own_bytes or self._needs_outcome):
             return True
         sender = decode_frame(frame[:end]).sender
-        for row, agent in enumerate(self._ids):
-            if agent == sender or (mask is not None and not mask[row]):
+        for row, table in enumerate(self.tables):
+            if table.agent == sender or (mask is not None and not mask[row]):
                 continue
             self._outcome[row] = SlotOutcome.FRAME
             offset = end
             for part, size in self._data_parts[row]:
                 if size:
-                    part.receive_data(self.tables[row], slot, sender, frame[offset : offset + size])
+                    part.receive_data(table, slot, sender, frame[offset : offset + size])
                 offset += size
         return True
 
@@ -234,7 +221,7 @@ class PluginSwarm(Swarm):
 
     def restart(self, local_index: int) -> None:
         super().restart(local_index)
-        for registry, parts in zip(_REGISTRIES, (self.policies, self.estimators, self.avoiders), strict=True):
+        for registry, parts in zip(REGISTRIES.values(), (self.policies, self.estimators, self.avoiders), strict=True):
             parts[local_index : local_index + 1] = self._make_instances(registry, [self.ids[local_index]])
         self._list_data_parts()
 
@@ -246,6 +233,90 @@ class PluginSwarm(Swarm):
             if self.active[index] and self.present[index]:
                 self.command[:, index] = avoider.check_command(avoider.command(self.tables[index], slot, step), slot)
 
-    def with_own_tables(self, slot: int) -> Swarm:
-        """Not supported: agents have tables of their own already."""
-        raise ValueError("with_own_tables: agents with plug-ins have tables of their own already")
+
+class Guarded:
+    """One instance of a plug-in, of a kind as in ``_REQUIRED``, with the instance's methods.
+
+    :raises PluginError: if the factory or a method raises an error, lacks the method of its kind, or returns a value
+        that is not allowed. A ConfigError (of options, for instance) stays one.
+    """
+
+    def __init__(self, kind: str, name: str, factory: Callable[..., Any], *arguments: object) -> None:
+        self.name = f"{kind} {name}"
+        self.instance = _guarded(self.name, factory)(*arguments)
+        required = [_REQUIRED[kind]]
+        if kind == "policy":
+            required = [next((text for text in _FOR_COMPARISON if _has(factory, text)), required[0])]
+        if kind != "avoider" and getattr(factory, "own_bytes", None):
+            required += _OWN_DATA
+        missing = [text for text in required if not _has(self.instance, text)]
+        if missing:
+            raise PluginError(self.name, f"{type(self.instance).__name__} has no method {' and '.join(missing)}")
+
+    def __getattr__(self, method: str) -> Callable[..., Any]:
+        """A method of the instance, guarded; made at the first call."""
+        call = _guarded(f"{self.name}, {method}", getattr(self.instance, method))
+        setattr(self, method, call)
+        return call
+
+    def check_senders(self, answer: Any, slot: int, agents: int) -> list[int]:
+        """Check the return value of ``senders``: ids."""
+        try:
+            ids = list(answer)
+        except Exception:
+            self._fail("senders", f"gave {shown(answer)} in slot {slot}; allowed: a list of the ids that send")
+        return [self.check_id(agent, "senders", slot, 1, agents) for agent in ids]
+
+    def check_id(self, answer: object, method: str, slot: int, low: int, high: int) -> int:
+        """Check an id that a method returned; 0, where it is allowed, means no agent."""
+        least = "1" if low else "0 (no agent)"
+        try:
+            number = operator.index(answer)  # type: ignore[arg-type]
+        except Exception:  # whatever its __index__ raises
+            number, least = low - 1, f"an integer, {least}"
+        if not low <= number <= high:
+            self._fail(method, f"chose agent {shown(answer)} in slot {slot}; allowed: {least} to {high}")
+        return number
+
+    def check_own_data(self, answer: object, size: int) -> bytes:
+        """Check the return value of ``own_data``: as many bytes as ``own_bytes`` declares."""
+        if not isinstance(answer, (bytes, bytearray)) or len(answer) != size:
+            given = f"{len(answer)} bytes" if isinstance(answer, (bytes, bytearray)) else shown(answer)
+            self._fail("own_data", f"gave {given}, declared {size}")
+        return bytes(answer)
+
+    def check_command(self, answer: Any, slot: int) -> tuple[float, ...]:
+        """Check the return value of ``command``: three finite numbers, m/s."""
+        try:
+            velocity = tuple(float(value) for value in answer)
+        except Exception:
+            velocity = ()
+        if len(velocity) != 3 or not all(map(math.isfinite, velocity)):
+            self._fail("command", f"gave {shown(answer)} in slot {slot}; allowed: three finite numbers")
+        return velocity
+
+    def check_estimates(self, *arrays: NDArray[np.float64], slot: int) -> None:
+        """Check that ``estimate`` has written finite numbers."""
+        if not all(np.isfinite(array).all() for array in arrays):
+            self._fail("estimate", f"wrote a number that is not finite in slot {slot}")
+
+    def _fail(self, method: str, fault: str) -> NoReturn:
+        raise PluginError(f"{self.name}, {method}", fault) from None
+
+
+def _has(part: object, method: str) -> bool:
+    return callable(getattr(part, method.partition("(")[0], None))
+
+
+def _guarded(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def call(*arguments: object) -> Any:
+        try:
+            return function(*arguments)
+        except DtsaError:
+            raise
+        except (Exception, SystemExit, GeneratorExit) as error:  # a plug-in does not end the program
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{frame.filename}:{frame.lineno}"
+            raise PluginError(part, f"{type(error).__name__}: {error} ({place})") from error
+
+    return call

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, field, replace
 
 from dtsa_agent.core.frame import ExtendedFrame, Frame
-from dtsa_agent.core.reference.arithmetic import Vector, minus, norm, norm1
-from dtsa_agent.core.reference.frame import FAR_REACH, LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH, SECTION_BYTES
-from dtsa_agent.core.reference.table import Table
 
-from .memory import HANDED, MISSED, Lease, Memory
+from .arithmetic import Vector, minus, norm, norm1
+from .frame import FAR_REACH, LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH, SECTION_BYTES
+from .lease import HANDED, MISSED, Lease, Memory
+from .table import Table
 
 NEED, MAX_NEED = 50.0, 6000.0  # NEED: s/m
 HAND_ON_FACTOR = 2  # a mover hands on turns that are worth so many times as much to another agent
@@ -41,11 +41,7 @@ class LeaseCandidates:
 def announce_turns(
     memory: Memory, table: Table, own: Frame, slot: int, velocity: Vector, final: bool, leaves: bool
 ) -> ExtendedFrame:
-    """The agent's frame but for gossip; the turns that it gives away are noted.
-
-    :param own: what it says of itself.
-    :param velocity: of the agent, m/s.
-    """
+    """The agent's frame but for gossip; the turns that it gives away are noted. ``own``: what it says of itself."""
     own_turn = memory.owner(slot) == memory.me
     memory.spoke = slot
     leaving = memory.leaving = own_turn and leaves
@@ -119,13 +115,8 @@ def sets_out(memory: Memory, table: Table, k: int) -> bool:
 def open_block(agents: int, every: int, resting: int, settled: int) -> int:
     """B: one turn in B slots is OPEN, for agents that start moving; 0: none.
 
-    B slots contain S turns of resting agents, and half as many more if all of these are at their final goals. B has no
-    factor in common with N: otherwise the same few owners would always give their turns.
-
-    :param agents: N, number of agents.
-    :param every: S, number of turns of resting agents of which one is OPEN.
-    :param resting: number of resting agents.
-    :param settled: number of these at their final goals.
+    B slots contain S (``every``) turns of resting agents, and half as many more if all of these have settled: are at
+    their final goals. B has no factor in common with N: otherwise the same few owners would always give their turns.
     """
     if not every or not resting:
         return 0
@@ -227,10 +218,7 @@ def worth(candidates: LeaseCandidates, k: int, turn: int) -> int:
 
 
 def choose_lessee(candidates: LeaseCandidates, turn: int, but: int = -1) -> int:
-    """Return the agent to which a turn is worth most, the lowest id of several; -1: no agent is able.
-
-    :param but: index of an agent that is left out.
-    """
+    """Return the agent to which a turn is worth most, the lowest id of several, ``but`` left out; -1: none is able."""
     able = [k for k, is_able in enumerate(candidates.able) if is_able and k != but]
     return max(able, key=lambda k: worth(candidates, k, turn), default=-1)  # the first of several
 

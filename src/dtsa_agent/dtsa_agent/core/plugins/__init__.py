@@ -1,1 +1,0 @@
-"""Policies, estimators and avoiders from other packages: found, checked, called."""
