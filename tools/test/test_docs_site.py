@@ -88,7 +88,7 @@ def test_pages_and_tables_are_made_from_the_code(site: Path) -> None:
 def test_types_of_settings_are_those_of_the_settings() -> None:
     from dtsa_dev.documents.pages import run_settings
 
-    assert (ROOT / "src" / "dtsa_bench" / "dtsa" / "_settings.py").read_text(encoding="utf-8") == run_settings()
+    assert (ROOT / "src" / "dtsa_bench" / "dtsa" / "_settings.pyi").read_text(encoding="utf-8") == run_settings()
 
 
 def test_dead_links_and_pages_that_nobody_finds_end_the_build(tmp_path: Path) -> None:

@@ -105,14 +105,9 @@ def plot_ages(*flights: FlightLog, titles: Sequence[str] | None = None, ax: Pane
 
 
 def _plot_over_time(
-    flights: Sequence[FlightLog],
-    titles: Sequence[str] | None,
-    ax: Panels,
-    title: str,
-    series: Callable[[FlightLog], Any],
-    *,
-    crash: bool = False,
-) -> Figure:
+    flights: Sequence[FlightLog], titles: Sequence[str] | None, ax: Panels, title: str,
+    series: Callable[[FlightLog], Any], crash: bool = False,
+) -> Figure:  # fmt: skip
     """A line a flight: its series by time, s; with `crash` a dotted one where two have crashed."""
     names = _titles(flights, titles)
     with style():
@@ -144,14 +139,9 @@ def plot_bars(
 
 
 def plot_lines(
-    result: SweepResult,
-    *,
-    x: str,
-    y: str | Sequence[str],
-    series: str | None = None,
-    facets: str | None = None,
+    result: SweepResult, *, x: str, y: str | Sequence[str], series: str | None = None, facets: str | None = None,
     ax: Panels = None,
-) -> Figure:
+) -> Figure:  # fmt: skip
     """Lines over the numbers of an axis of a sweep, with 95 % intervals.
 
     :param result: the sweep.

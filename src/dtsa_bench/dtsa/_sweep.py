@@ -98,16 +98,10 @@ def _refuse_registered(plan: Sweep, field: str, value: object) -> None:
 
 
 def sweep(
-    preset: str | None = None,
-    *,
-    axes: Mapping[str, Sequence[Any] | Mapping[str, Mapping[str, Any]]] | None = None,
-    base: Mapping[str, Any] | None = None,
-    seeds: int | Sequence[int] | None = None,
-    first_seed: int | None = None,
-    jobs: int = 1,
-    out: str | Path | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> SweepResult:
+    preset: str | None = None, *, axes: Mapping[str, Sequence[Any] | Mapping[str, Mapping[str, Any]]] | None = None,
+    base: Mapping[str, Any] | None = None, seeds: int | Sequence[int] | None = None, first_seed: int | None = None,
+    jobs: int = 1, out: str | Path | None = None, progress: Callable[[int], None] | None = None,
+) -> SweepResult:  # fmt: skip
     """Fly every combination of some settings with every seed.
 
     :param preset: a sweep that comes with the package (`dtsa sweep --list`), instead of axes.

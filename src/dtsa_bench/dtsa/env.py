@@ -25,13 +25,9 @@ __all__ = [
 
 
 def parallel_env(
-    config: RunConfig | None = None,
-    *,
-    reward: Reward | None = None,
-    slots: int | None = None,
-    render_mode: str | None = None,
-    **settings: Unpack[RunSettings],
-) -> SwarmEnv:
+    config: RunConfig | None = None, *, reward: Reward | None = None, slots: int | None = None,
+    render_mode: str | None = None, **settings: Unpack[RunSettings],
+) -> SwarmEnv:  # fmt: skip
     """One flight as a `ParallelEnv` of PettingZoo.
 
     :param config: what is flown, without its policy; None: made from the settings.

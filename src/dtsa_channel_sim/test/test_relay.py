@@ -345,7 +345,6 @@ def test_what_is_wrong_is_named_and_nothing_ends(graph: Graph, tmp_path: Path) -
         ({"robot1": {"topics": {"x": {"type": "no_msgs/msg/Nothing"}}}, "robot2": {}}, {}, "no_msgs/msg/Nothing"),
         ({"robot1": {"topics": {"x": {"type": "Pose"}}}, "robot2": {}}, {}, "'Pose'"),
         ({"robot1": {"topics": {"x": {}}}, "robot2": {}}, {"range_m": 5}, "robots.robot1.place"),
-        ({"robot1": {"topics": {"x": {"bytes": 100}}}, "robot2": {}}, {"access": "tdma", "slot_ms": 0.3}, "a slot has"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_one_line(

@@ -110,7 +110,7 @@ def _library() -> Iterator[str]:
 
 
 def run_settings() -> str:
-    """The module ``dtsa/_settings.py``: a TypedDict of all settings that `simulate` takes by name."""
+    """The module ``dtsa/_settings.pyi``: a TypedDict of all settings that `simulate` takes by name."""
     simple = {"int": "int", "float": "float", "bool": "bool", "text": "str", "values": "Mapping[str, float]"}
     lines = []
     for name in sorted(names := setting_specs()):
@@ -125,7 +125,7 @@ def run_settings() -> str:
     return (
         '"""The settings of `simulate` and `run_config`: made by `python -m dtsa_dev.documents.pages`."""\n\n'
         "from __future__ import annotations\n\nfrom collections.abc import Mapping\n"
-        "from typing import Any, Literal, TypedDict\n\n\n"
+        "from typing import Any, Literal, TypedDict\n\n"
         "class RunSettings(TypedDict, total=False):\n"
         '    """Units and ranges: docs/reference/settings.md and docs/reference/channel.md."""\n\n' + "".join(lines)
     )
@@ -136,4 +136,4 @@ def _entry(identifier: str, members: bool) -> str:
 
 
 if __name__ == "__main__":
-    (_SOURCES / "dtsa_bench" / "dtsa" / "_settings.py").write_text(run_settings(), encoding="utf-8")
+    (_SOURCES / "dtsa_bench" / "dtsa" / "_settings.pyi").write_text(run_settings(), encoding="utf-8")

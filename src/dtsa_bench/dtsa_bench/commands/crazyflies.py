@@ -184,11 +184,11 @@ policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in
         from dtsa_agent.core.settings.declaration import parse_values
         from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
         from dtsa_bench.crazyflies.peer_lab.process import fly
-        from dtsa_bench.runs.options import given_options, new_directory
+        from dtsa_bench.runs.options import new_directory, option_values
 
         if not 0.0 < args.seconds <= 1e6:
             raise ConfigError("seconds", args.seconds, "more than 0, up to 1000000")
-        settings = LabSettings(**given_options(args, LabSettings, "lab"))
+        settings = LabSettings(**option_values(args, LabSettings, "lab"))
         parameters = {}
         for text in args.set:
             try:

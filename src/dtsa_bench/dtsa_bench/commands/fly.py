@@ -21,7 +21,7 @@ from dtsa_bench.runs.options import (
     add_mode_options,
     add_options,
     add_run_options,
-    given_options,
+    option_values,
     run_config,
     whole_number,
 )
@@ -97,7 +97,7 @@ Starts the channel and the agents as ROS 2 nodes, records the flight, and ends t
 
         options = FlightOptions(
             processes=process_count(args.processes, config.swarm.agents), domain=domain, pictures=args.picture,
-            late=late_agents(args.late), **given_options(args, FlightOptions, "flight"),
+            late=late_agents(args.late), **option_values(args, FlightOptions, "flight"),
         )  # fmt: skip
         page = page_options(args)
         with Stop(LONGEST_END_S) as stop, ExitStack() as pages:

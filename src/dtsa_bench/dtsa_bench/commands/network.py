@@ -19,7 +19,7 @@ from dtsa_agent.core.settings.declaration import Setting, Settings, names_with_v
 from dtsa_agent.core.station import check_joinable
 from dtsa_agent.keys import check_key, check_session
 from dtsa_agent.yaml_file import read_yaml
-from dtsa_bench.runs.options import add_options, given_options, new_directory, number
+from dtsa_bench.runs.options import add_options, new_directory, number, option_values
 
 from .registry import Command, add_rows, warn
 
@@ -67,7 +67,7 @@ def read_network_options(args: argparse.Namespace) -> tuple[PortSettings, SwarmC
         for name, value in values.items() if value is not None
     })  # fmt: skip
     named = {"policy": args.policy or DEFAULT_POLICY, "auth": args.seal is not False}
-    config = SwarmConfig.from_dict({**given_options(args, SwarmConfig, "swarm"), **named})
+    config = SwarmConfig.from_dict({**option_values(args, SwarmConfig, "swarm"), **named})
     check_key(config)  # before anything is made
     check_session(config)
     return port, config
@@ -134,7 +134,7 @@ environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
         from dtsa_bench.network.flying import AgentJob, check, fly
 
         port, config = read_network_options(args)
-        own = AgentSettings.from_dict(given_options(args, AgentSettings, "own"))
+        own = AgentSettings.from_dict(option_values(args, AgentSettings, "own"))
         check_joinable(config.policy)  # before anything is made
         check_fits(config, port.properties)
         job = AgentJob(own, config, port, args.out, args.json)

@@ -28,14 +28,9 @@ _MOST_POINTS, _MOST_OF_ONE, _LEAST_OF_ONE = 8000, 80, 12  # in an SVG: of all pa
 
 
 def paint(
-    axes: Axes,
-    path: Track,
-    moving: NDArray[np.bool_],
-    *,
-    crash: Sequence[int] | None = None,
-    ids: bool = True,
+    axes: Axes, path: Track, moving: NDArray[np.bool_], *, crash: Sequence[int] | None = None, ids: bool = True,
     scale: float = 1.0,
-) -> None:
+) -> None:  # fmt: skip
     """Paint a flight from above: rings where agents start, discs where they end; agents that hover are grey discs.
 
     :param crash: ids of two agents that crashed at the end; a ring is drawn around them.

@@ -54,11 +54,6 @@ def style() -> Iterator[None]:
         yield
 
 
-def colour(name: object, index: int) -> str:
-    """The colour of a series by its index in the figure, from 0; schemes have a colour of their own, by name."""
-    return COLOURS.get(str(name), CYCLE[index % len(CYCLE)])
-
-
 def colours(names: Sequence[object]) -> list[str]:
     """Colours of the series of one figure, all different."""
     taken = [COLOURS.get(str(name)) for name in names]

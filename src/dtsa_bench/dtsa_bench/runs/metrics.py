@@ -110,11 +110,6 @@ class FlightMetrics:
         return int(self.kernel.slots)
 
     @property
-    def completion_slot(self) -> int:
-        """Slots flown when all had arrived at the same time, -1: not yet."""
-        return int(self.kernel.completion_slot)
-
-    @property
     def crash_slot(self) -> int:
         """Slots flown when the first two had crashed, -1: none have."""
         return int(self.kernel.crash_slot)
@@ -212,7 +207,7 @@ class FlightMetrics:
         """
         path, plan = self._path, self.scenario.plan
         if plan is not None and len(plan.goals) > 1:
-            if self.completion_slot < 0:
+            if self.kernel.completion_slot < 0:  # not all have arrived at the same time
                 return {}
             direct = self.scenario.path_length
         else:
@@ -224,7 +219,7 @@ class FlightMetrics:
 
         A figure that does not exist (no movers, not complete, ...) is None.
         """
-        swarm, sums = self.run.swarm, self.kernel
+        swarm, sums, complete = self.run.swarm, self.kernel, self.kernel.completion_slot >= 0
         flown = self.slots * swarm.slot_ns / 1e9
         pair = [sums.pair_1, sums.pair_2] if sums.pair_1 else None
         news = sums.age_count
@@ -235,7 +230,7 @@ class FlightMetrics:
         return {
             "agents": swarm.agents, "moving": swarm.movers, "policy": swarm.policy, "estimator": swarm.estimator,
             "avoider": swarm.avoider, "slot_ms": swarm.slot_ms, "loss": self.run.air.loss, "seed": swarm.seed,
-            "end": self.end or STOPPED, "completed": self.completion_slot >= 0, "timed_out": self.end == TIMED_OUT,
+            "end": self.end or STOPPED, "completed": complete, "timed_out": self.end == TIMED_OUT,
             "collided": self.crash_slot >= 0,
             "collided_pair": list(self.collided_pair) if self.collided_pair else None,
             "slots": {"total": self.slots, **{name: sums.outcomes[code] for name, code in outcomes.items()}},
@@ -243,7 +238,7 @@ class FlightMetrics:
             "min_distance_pair": pair,
             "min_distance_time_s": sums.min_slot * swarm.slot_ns / 1e9 if pair else None,
             "efficiency_mean": sum(efficiency) / len(efficiency) if efficiency else None,
-            "completion_time_s": self.completion_slot * swarm.slot_ns / 1e9 if self.completion_slot >= 0 else None,
+            "completion_time_s": sums.completion_slot * swarm.slot_ns / 1e9 if complete else None,
             "flight_time_s": flown,
             "first_divergence_slot": sums.split_slot if sums.split_slot >= 0 else None,
             "equal_tables_share": 1.0 - sums.split / sums.compared if sums.compared else 1.0,

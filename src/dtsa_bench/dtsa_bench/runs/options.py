@@ -46,7 +46,7 @@ def add_mode_options(parser: argparse.ArgumentParser) -> Any:
 def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "", skip: Collection[str] = ()) -> None:
     """Add an option for every setting of a settings class that fits into one.
 
-    :param section: what :func:`given_options` calls these options.
+    :param section: what :func:`option_values` calls these options.
     :param prefix: stands before the setting's name in the option's.
     """
     for setting in settings_of(cls):
@@ -54,7 +54,7 @@ def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "",
             _add(group, setting, section, prefix)
 
 
-def given_options(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
+def option_values(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
     """The values of those options of :func:`add_options` that were given, by name.
 
     :raises ConfigError: for a text that is no value of its setting's kind.
@@ -92,15 +92,15 @@ def run_config(args: argparse.Namespace, **fixed: Any) -> RunConfig:
 
     :raises ConfigError: naming the option, the value and what is allowed.
     """
-    values = {section: given_options(args, cls, section) for section, cls, _ in _SECTIONS}
+    values = {section: option_values(args, cls, section) for section, cls, _ in _SECTIONS}
     swarm = SwarmConfig.from_dict({**values["swarm"], **fixed})
     derived = from_swarm(swarm)
     settings = {**values["channel"], **derived}
     file = getattr(args, "channel", None)
     channel = ChannelConfig.from_yaml(file, **settings) if file else ChannelConfig.from_dict(settings)
-    clocks = ClockConfig(seed=swarm.seed, **given_options(args, ClockConfig, "clocks"))
+    clocks = ClockConfig(seed=swarm.seed, **option_values(args, ClockConfig, "clocks"))
     limits = RunLimits(**values["limits"])
-    return RunConfig(swarm, channel, limits, clocks=clocks, **given_options(args, RunConfig, "run"))
+    return RunConfig(swarm, channel, limits, clocks=clocks, **option_values(args, RunConfig, "run"))
 
 
 def whole_number(text: str, name: str, minimum: int, maximum: int) -> int:

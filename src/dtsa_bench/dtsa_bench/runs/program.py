@@ -1,10 +1,27 @@
-"""Name of the command line: `tools/dtsa` in a checkout, `dtsa` where it has been installed."""
+"""Name of the command line, and the end of processes that it has started."""
 
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 
 
 def program() -> str:
-    """Words in front of a command that a message names; `tools/dtsa` says it in the environment."""
+    """Return the words in front of a command that a message names: `tools/dtsa` in a checkout, else `dtsa`."""
     return os.environ.get("DTSA_PROGRAM", "dtsa")
+
+
+def end_process(
+    process: subprocess.Popen[str] | subprocess.Popen[bytes], patience_s: float, ask: signal.Signals = signal.SIGINT
+) -> bool:
+    """Ask a process to end and kill it if it does not in time; return whether it has ended by itself."""
+    if process.poll() is None:
+        process.send_signal(ask)
+    try:
+        process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return False
+    return True

@@ -60,8 +60,7 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         self._space, self._positions, self._next_seed = space, positions, self._config.seed
         if positions is None and (self._config.needs_positions or self._config.access == "error"):
             raise ConfigError("positions", None, "a function that returns where agents are, as the channel needs it")
-        if fault := Transport(self._config).fault_of(size):
-            raise ConfigError("size", size, f"what can be sent: {fault}")
+        Transport(self._config).check_length(self._size, "size")
         self._spaces: dict[str, tuple[Any, Any]] = {}  # of observations and actions
         self._parts: dict[str, dict[str, Any]] = {name: {} for name in self._names}  # known, of what others send
         self._first: dict[str, Any] = {}  # what is known at first: 0, or the nearest values that the space allows
@@ -131,24 +130,23 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
             if name in sent and present[sender - 1]:
                 self._transport.send(RadioMessage(sender, "", step, self._size, now_ns, present, sent[name]))
         self._transport.advance(now_ns + self._step_ns, self._places())
-        completed: dict[str, Any] = {}
-        completed_infos = dict(infos)
+        observations, infos = dict(observations), dict(infos)
         for name, newest in zip(names, self._transport.newest, strict=True):
             received = {other: message for other, message in zip(names, newest, strict=True) if other != name}
             if name in infos:
                 age = {other: step - message.number if message else -1 for other, message in received.items()}
-                completed_infos[name] = {**infos[name], "age": age}
+                infos[name] = {**infos[name], "age": age}
             if name not in observations:
                 continue
             parts, first = self._parts[name], self._first[name]
             known = {other: received[other].payload[name] if received[other] else first for other in parts}
             if self._space is not None:
-                completed[name] = {"observation": observations[name], "messages": known}
+                observations[name] = {"observation": observations[name], "messages": known}
                 continue
-            completed[name] = np.array(observations[name])
+            observations[name] = np.array(observations[name])
             for other, part in parts.items():
-                completed[name][part] = known[other][part]
-        return completed, completed_infos
+                observations[name][part] = known[other][part]
+        return observations, infos
 
     def _places(self) -> NDArray[np.float64] | None:
         """Return where agents are, (3, N), m."""

@@ -13,7 +13,7 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.commands.network import read_network_options
 from dtsa_bench.commands.registry import load_command
-from dtsa_bench.runs.options import given_options
+from dtsa_bench.runs.options import option_values
 
 SHARED = """\
 air: udp
@@ -45,7 +45,7 @@ def test_settings_of_a_file_stand_for_options_and_options_go_before_them(tmp_pat
     wanted = SwarmConfig(agents=12, policy="tdma", slot_ms=30.0, epsilon=0.3, auth=False)
     assert swarm == wanted
     assert (port.to_dict()["group"], port.to_dict()["interface"]) == ("239.1.2.3:9", "lo")
-    assert given_options(args, AgentSettings, "own") == {"id": 3, "priority": 0}
+    assert option_values(args, AgentSettings, "own") == {"id": 3, "priority": 0}
     for command in ("sniff", "view"):
         _, port, swarm = parsed(["--swarm", str(path)], command)
         assert swarm.slot_ms == 20.0

@@ -47,7 +47,7 @@ def test_completion_is_when_all_are_near_and_one_that_has_not_arrived_is_enough_
     summary = metrics.summary(2.4)
     assert ends[:-1] == [""] * (len(ends) - 1)
     assert ends[-1] == COMPLETED
-    assert metrics.completion_slot == 19
+    assert metrics.kernel.completion_slot == 19
     assert summary["completion_time_s"] == pytest.approx(1.9)
     assert summary["flight_time_s"] == pytest.approx(2.4)
     assert summary["slots"] == {"total": 24, "success": 24, "collision": 0, "idle": 0}

@@ -240,11 +240,11 @@ def test_the_radio_of_an_agent_that_is_switched_off_sends_nothing() -> None:
     options = {"csma.period_ms": 15.0, "csma.window_ms": 60.0}
     air, _, _ = traffic("csma", 0, frame="extended", options=options)
     slots = iter(range(2000))
-    while not air._radios.holds(4):
+    while (3, 1) not in air._due_ns:  # its radio listens
         air.slot(next(slots))
-    air._swarm.present[3] = 0
+    air.swarm.present[3] = 0
     assert not any(4 in air.slot(next(slots)).senders for _ in range(100))
-    air._swarm.present[3] = 1
+    air.swarm.present[3] = 1
     assert any(4 in air.slot(next(slots)).senders for _ in range(100))
 
 
@@ -279,7 +279,7 @@ def test_the_token_ring_takes_as_long_as_its_packets_and_survives_losses() -> No
     everybody_else = [mask.argmax() for _, mask in heard[:19]]
     assert sorted(everybody_else) == list(range(1, 20))
     assert not any(slot.outcome == COLLISION for slot in carried)
-    air._swarm.present[7] = 0
+    air.swarm.present[7] = 0
     after = [air.slot(slot) for slot in range(1000, 1400)]
     # Frames are sent to it again and again.
     assert {int(mask.argmax()) for slot in after[200:] for _, _, mask in slot.heard} == {7}

@@ -6,7 +6,6 @@ import itertools
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib import import_module
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,11 +16,13 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting
 from dtsa_agent.ros.common.checks import Intake, check_numbers
 from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.names import message_class
 from dtsa_agent.ros.common.node_process import ending, run_node
 from dtsa_agent.ros.common.parameters import check_parameters, declare_setting
 from dtsa_agent.stop import Stop, leave_at_once
@@ -37,17 +38,6 @@ _TICK_S, _REPORT_TICKS, _REMIND_TICKS = 0.5, 2, 20  # of checks for topics; diag
 _JUMP_NS = 10_000_000_000  # by which no clock moves on its own
 _NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)  # an executor checks each one every time
 _MAX_FRAMES, _MAX_DEPTH = 10_000, 64  # of /tf
-
-
-def message_class(name: str) -> Any:
-    """Return the class of a message type, ``package/msg/Name``; a ConfigError if its package is not installed."""
-    package, _, class_name = name.partition("/msg/")
-    try:
-        message_type = getattr(import_module(f"{package}.msg"), class_name)
-        message_type.__class__.__import_type_support__()
-    except Exception as error:  # what an incomplete package raises has no common base
-        raise ConfigError("type", name, f"an installed message type ({error})") from None
-    return message_type
 
 
 class TransformTree:
@@ -84,28 +74,29 @@ class Relay:
 
     def __init__(self, node: Node, settings: RelaySettings) -> None:
         self._node, self._logger, self._intake = node, node.get_logger(), Intake(node.get_logger())
-        channel, self._robots, self._awaited = settings.read()
-        self._names, self._transport = list(self._robots), Transport(channel)
+        channel, robots, self._awaited = settings.read()
         for topic in self._awaited:
             if topic.type:
                 message_class(topic.type)
-        self._publishers: dict[tuple[str, int], Publisher] = {}  # by source and the receiver's row
+        self._names, self._transport = list(robots), Transport(channel)
         self._refused: set[str] = set()  # sources with messages that do not fit
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._clock_ns, self._now_ns = node.get_clock().now().nanoseconds, 0
-        self._positions = np.full((3, len(self._robots)), np.nan)  # m, of the robots; not numbers: not known yet
-        self._tree = TransformTree(settings.map_frame)
+        self._positions = np.full((3, len(robots)), np.nan)  # m; not numbers: not known yet
         self._feeds: list[tuple[Feed, Callable[[Any], None]]] = []  # what says where robots are
-        for row, (name, robot) in enumerate(self._robots.items()):
+        self._tree, self._frames = TransformTree(settings.map_frame), dict[int, str]()  # of robots, by row
+        for row, (name, robot) in enumerate(robots.items()):
             if robot.odometry:
-                topic = full_name(name, robot.odometry, "odometry")
-                self._follow("nav_msgs/msg/Odometry", topic, partial(self._accept_odometry, row))
+                accept, source = partial(self._accept_odometry, row), full_name(name, robot.odometry, "odometry")
+                self._follow("nav_msgs/msg/Odometry", source, accept, reliability=ReliabilityPolicy.BEST_EFFORT)
             elif robot.tf:
-                self._positions[:, row] = self._tree.place_of(robot.tf)
+                self._frames[row], self._positions[:, row] = robot.tf, self._tree.place_of(robot.tf)
             else:
                 self._positions[:, row] = robot.place or 0.0  # 0: it does not matter
-        for topic in ("/tf", "/tf_static") if any(robot.tf for robot in self._robots.values()) else ():
-            self._follow("tf2_msgs/msg/TFMessage", topic, self._tree.accept)
+        if self._frames:
+            static = DurabilityPolicy.TRANSIENT_LOCAL
+            self._follow("tf2_msgs/msg/TFMessage", "/tf", self._tree.accept)
+            self._follow("tf2_msgs/msg/TFMessage", "/tf_static", self._tree.accept, durability=static)
 
     def run(self, stop: Stop) -> None:
         """Relay until a signal."""
@@ -117,9 +108,9 @@ class Relay:
             executor.spin_once(timeout_sec=min(_MAX_WAIT_S, max(_MIN_WAIT_S, wait_s)))
             self._update_positions()
             for message, received in self._transport.advance(self._update_time(), self._positions):
-                source, data = message.payload
+                publishers, data = message.payload
                 for row in np.flatnonzero(received).tolist():
-                    self._publishers[source, row].publish(data)
+                    publishers[row].publish(data)
             if time.monotonic() >= next_tick_s:
                 next_tick_s = time.monotonic() + _TICK_S
                 self._tick(next(ticks))
@@ -133,18 +124,14 @@ class Relay:
 
     # Where robots are.
 
-    def _follow(self, type_name: str, topic: str, accept: Callable[[Any], None]) -> None:
-        qos = QoSProfile(depth=_DEPTH)
-        if topic == "/tf_static":  # of a publisher that may have spoken before
-            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        elif topic != "/tf":
-            qos.reliability = ReliabilityPolicy.BEST_EFFORT
+    def _follow(self, type_name: str, topic: str, accept: Callable[[Any], None], **policies: Any) -> None:
+        qos = QoSProfile(depth=_DEPTH, **policies)
         self._feeds.append((Feed(self._node, message_class(type_name), topic, qos, intake=self._intake), accept))
 
     def _accept_odometry(self, row: int, message: Any) -> None:
         position = message.pose.pose.position
-        check_numbers("places", numbers := (position.x, position.y, position.z))
-        self._positions[:, row] = numbers
+        check_numbers("places", place := (position.x, position.y, position.z))
+        self._positions[:, row] = place
 
     def _update_positions(self) -> None:
         is_changed = False
@@ -153,15 +140,20 @@ class Relay:
                 is_changed = True
                 with self._intake.guard():
                     accept(message)
-        for row, robot in enumerate(self._robots.values()):
-            if is_changed and robot.tf:
-                self._positions[:, row] = self._tree.place_of(robot.tf)
+        for row, frame in self._frames.items() if is_changed else ():
+            self._positions[:, row] = self._tree.place_of(frame)
 
     # Messages.
 
     def _tick(self, tick: int) -> None:
-        """Look for topics; now and then say what is missing, and how pairs are doing."""
-        self._awaited = [topic for topic in self._awaited if not self._open(topic)]
+        """Relay topics that have a publisher by now; now and then say what is missing, and how pairs are doing."""
+        for topic in self._awaited.copy():
+            if sources := self._node.get_publishers_info_by_topic(topic.source):
+                self._awaited.remove(topic)
+                try:
+                    self._relay(topic, sources)
+                except ConfigError as error:
+                    self._logger.error(f"{topic.source}: {error}")
         missing = [topic.source for topic in self._awaited]
         missing += [f"the place of {self._names[row]}" for row in np.flatnonzero(np.isnan(self._positions[0]))]
         if tick % _REMIND_TICKS == _REPORT_TICKS:
@@ -170,71 +162,61 @@ class Relay:
         if tick % _REPORT_TICKS == 0:
             self._report(f"waits for {', '.join(missing)}" if missing else "relays")
 
-    def _open(self, topic: RelayedTopic) -> bool:
-        """Subscribe to a topic if it has a publisher; return whether nothing is left to do."""
-        publishers = self._node.get_publishers_info_by_topic(topic.source)
-        if not publishers:
-            return False
-        type_name = publishers[0].topic_type
-        try:
-            if topic.type not in ("", type_name):
-                raise ConfigError("type", type_name, f"{topic.type}, as the file says")
-            message_type = message_class(type_name)
-        except ConfigError as error:
-            self._logger.error(f"{topic.source}: {error}")
-            return True
+    def _relay(self, topic: RelayedTopic, sources: Sequence[TopicEndpointInfo]) -> None:
+        type_name = sources[0].topic_type
+        if topic.type not in ("", type_name):
+            raise ConfigError("type", type_name, f"{topic.type}, as the file says")
+        message_type = message_class(type_name)
         # The weaker of two policies is the larger number; one that ROS does not know has a number above both.
-        profiles = [info.qos_profile for info in publishers]
+        profiles = [source.qos_profile for source in sources]
         reliability = min(max(qos.reliability for qos in profiles), ReliabilityPolicy.BEST_EFFORT)
         durability = min(max(qos.durability for qos in profiles), DurabilityPolicy.VOLATILE)
         qos = QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability)
+        publishers, numbers = dict[int, Publisher](), itertools.count(1)
         for row in np.flatnonzero(topic.receivers).tolist():
             name = f"/{self._names[row]}/from/{self._names[topic.robot - 1]}/{topic.name.strip('/')}"
-            publisher = self._node.create_publisher(message_type, name, qos, event_callbacks=_NO_EVENTS)
-            self._publishers[topic.source, row] = publisher
-        numbers = itertools.count(1)
+            publishers[row] = self._node.create_publisher(message_type, name, qos, event_callbacks=_NO_EVENTS)
 
         def accept(data: bytes, info: Any) -> None:  # with two parameters rclpy gives the message's number, too
             for _ in range(_DEPTH):  # an executor takes one message at a time, and long for it
-                self._send(topic, data, info["publication_sequence_number"] or next(numbers))
+                number, length = info["publication_sequence_number"] or next(numbers), topic.bytes or len(data)
+                now_ns, payload = self._update_time(), (publishers, data)
+                message = RadioMessage(topic.robot, topic.name, number, length, now_ns, topic.receivers, payload)
+                try:
+                    self._transport.send(message)
+                except ConfigError as error:
+                    if topic.source not in self._refused:
+                        self._refused.add(topic.source)
+                        self._logger.error(f"{topic.source}: a message cannot be sent: {error}")
                 if (following := subscription.handle.take_message(message_type, True)) is None:
                     return
                 data, info = following
 
         subscription = self._node.create_subscription(message_type, topic.source, accept, qos, raw=True)
         self._logger.info(f"{topic.source}: {type_name}")
-        return True
-
-    def _send(self, topic: RelayedTopic, data: bytes, number: int) -> None:
-        length, payload = topic.bytes or len(data), (topic.source, data)
-        fault, now_ns = self._transport.fault_of(length), self._update_time()
-        if not fault:
-            message = RadioMessage(topic.robot, topic.name, number, length, now_ns, topic.receivers, payload)
-            self._transport.send(message)
-        elif topic.source not in self._refused:
-            self._refused.add(topic.source)
-            self._logger.error(f"{topic.source}: a message cannot be sent: {fault}")
 
     def _report(self, state: str) -> None:
         """Publish the state of the relay, and counts and ages of each pair."""
-        refused, counts = ", ".join(sorted(self._refused)), self._transport.counts
-        rows: list[tuple[str, str, dict[str, Any]]] = [
-            ("relay", state, {"access": self._transport.config.access, "refused": refused})
-        ]
+        counts, newest = self._transport.counts, self._transport.newest
+        report = DiagnosticArray()
+        report.header.stamp = self._node.get_clock().now().to_msg()
+
+        def add(name: str, text: str, **values: Any) -> None:
+            pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+            report.status.append(DiagnosticStatus(name=name, message=text, hardware_id="simulated", values=pairs))
+
+        add("relay", state, access=self._transport.config.access, refused=", ".join(sorted(self._refused)))
         for sender, receiver in np.argwhere(counts["sent"]).tolist():
             values = {name: counts[name][sender, receiver] for name in COUNTS}
-            newest = self._transport.newest[receiver, sender]
             delay_ms = counts["delay_ns"][sender, receiver] / max(1, values["received"]) / 1e6
-            values["delay_mean_ms"] = f"{delay_ms:.3f}"
-            values["age_ms"] = f"{(self._now_ns - newest.at_ns) / 1e6:.3f}" if newest else "-1"
-            name = f"relay: {self._names[sender]} to {self._names[receiver]}"
-            rows.append((name, f"{values['received']} of {values['sent']} received", values))
-        message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        for name, text, values in rows:
-            pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-            message.status.append(DiagnosticStatus(name=name, message=text, hardware_id="simulated", values=pairs))
-        self._diagnostics.publish(message)
+            message = newest[receiver, sender]
+            age = f"{(self._now_ns - message.at_ns) / 1e6:.3f}" if message else "-1"
+            add(
+                f"relay: {self._names[sender]} to {self._names[receiver]}",
+                f"{values['received']} of {values['sent']} received",
+                **values, delay_mean_ms=f"{delay_ms:.3f}", age_ms=age,
+            )  # fmt: skip
+        self._diagnostics.publish(report)
 
 
 def _body(stop: Stop, supervised: bool) -> None:

@@ -75,8 +75,8 @@ class RelaySettings(Settings):
                         to = names if relayed.to is None else relayed.to
                         if not isinstance(to, list) or not to or any(other not in names for other in to):
                             raise ConfigError("to", to, f"a list of robots: {', '.join(names)}")
-                        if relayed.bytes and (fault := transport.fault_of(relayed.bytes)):
-                            raise ConfigError("bytes", relayed.bytes, f"what can be sent: {fault}")
+                        if relayed.bytes:
+                            transport.check_length(relayed.bytes)
                     receivers = np.array([other in to and other != name for other in names])
                     topics[source] = replace(relayed, robot=robot, name=topic, source=source, receivers=receivers)
         if not topics:

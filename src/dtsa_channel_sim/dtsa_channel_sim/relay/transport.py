@@ -22,8 +22,7 @@ from dtsa_agent.core.swarm import Swarm
 from dtsa_channel_sim.model.air import NEVER, Air, Arrivals
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import ChannelConfig
-from dtsa_channel_sim.model.losses import Losses
-from dtsa_channel_sim.model.medium import Mask, Positions
+from dtsa_channel_sim.model.medium import Mask, Medium, Positions
 
 SLOTTED = ("tdma", "age", "error", "lease")
 ACCESS = ("unlimited", *SLOTTED, "csma", "aloha")
@@ -79,10 +78,10 @@ class Transport:
         self.newest = np.full((agents, agents), None)  # [receiver, sender]: newest message that has come; None: none
         self._heard_ns = np.full(agents, -1)  # when the newest message of each was sent that any agent received
         # Noise is drawn by messages, not by slots.
-        channel = Channel(replace(config, loss=0.0, burst_length=0.0, link_loss=(), loss_matrix=(), losses=""))
-        self._medium, self._airtime = channel.medium(0), config.airtime.of_messages(config.longest)
-        self._air: Air[tuple[RadioMessage, bytes]] = Air(channel, self._airtime)  # a frame's key: message, header
-        self._noise: dict[str, Losses] = {}  # by topic
+        quiet = Channel(replace(config, loss=0.0, burst_length=0.0, link_loss=(), loss_matrix=(), losses=""))
+        self._airtime = config.airtime.of_messages(config.longest)
+        self._air: Air[tuple[RadioMessage, bytes]] = Air(quiet, self._airtime)  # a frame's key: message, header
+        self._media: dict[str, Medium] = {}  # reach and noise, by topic
         self._queues: list[deque[RadioMessage]] = [deque() for _ in range(agents)]
         self._free_ns = [0] * agents  # when each radio has done with its last message
         self._begin_ns = [NEVER] * agents  # when each radio begins the message at hand; under csma: listens
@@ -96,21 +95,21 @@ class Transport:
         if config.access == "lease":
             swarm = SwarmConfig(agents, policy="lease", seed=config.seed, slot_ms=config.slot_ns / 1e6, extent_m=1e4)
             self._swarm, self._header_length = Swarm(swarm), swarm.frame_length
-            self._received_headers: list[tuple[bytes, Mask]] = []  # in this slot
             self._active_until = np.full(agents, -1)  # slot until which each has something to send
 
-    def fault_of(self, length: int) -> str:
-        """Return why messages of some bytes cannot be sent; empty: they can."""
+    def check_length(self, length: int, name: str = "bytes") -> None:
+        """Raise ConfigError if messages of some bytes cannot be sent."""
         if not 1 <= length <= self.config.longest:
-            return f"{length} bytes; longest allows 1 to {self.config.longest}"
+            raise ConfigError(name, length, f"1 to {self.config.longest}, which is longest")
         on_air_ns, slot_ns = self._airtime.total_ns(length + self._header_length), self.config.slot_ns
         if self._slotted and on_air_ns > slot_ns:
-            header = f" and the header of {self._header_length}" * bool(self._header_length)
-            return f"{length} bytes{header} take {on_air_ns / 1e6:.3g} ms, a slot has {slot_ns / 1e6:g} ms"
-        return ""
+            header = f" with a header of {self._header_length}" * bool(self._header_length)
+            times = f"these{header} take {on_air_ns / 1e6:.3g} ms, a slot has {slot_ns / 1e6:g} ms"
+            raise ConfigError(name, length, f"bytes that fit into a slot: {times}")
 
     def send(self, message: RadioMessage) -> None:
-        """Give a message, which ``fault_of`` lets through, to its sender's radio."""
+        """Give a message to its sender's radio; ConfigError: it is too long, and nothing has happened."""
+        self.check_length(message.length)
         index = message.sender - 1
         queue = self._queues[index]
         self.counts["sent"][index] += message.receivers
@@ -125,10 +124,11 @@ class Transport:
     def advance(self, until_ns: int, positions: Positions | None = None) -> list[tuple[RadioMessage, Mask]]:
         """Let time come to ``until_ns``; return what has arrived, in order, and its receivers, (N,)."""
         self._positions = positions
-        if self._slotted:
-            self._run_slots(until_ns)
-        else:
-            self._run_radios(until_ns)
+        while (now_ns := self._next_ns) <= until_ns:
+            if self._slotted:
+                self._begin_slot(now_ns)
+            else:
+                self._begin_radio(self._begin_ns.index(now_ns), now_ns)
         self._resolve(until_ns)
         arrived = self._arriving.pop(until_ns)
         for message, received in arrived:
@@ -140,27 +140,27 @@ class Transport:
     @property
     def due_ns(self) -> int:
         """Until when to advance next: before that nothing happens unless a message is sent."""
-        next_ns = self._slot * self.config.slot_ns if self._slotted else min(self._begin_ns)
-        return min(next_ns, self._air.due_ns, self._arriving.next_ns)
+        return min(self._next_ns, self._air.due_ns, self._arriving.next_ns)
 
     # Access.
 
-    def _run_slots(self, until_ns: int) -> None:
-        while (now_ns := self._slot * self.config.slot_ns) <= until_ns:
-            self._resolve(now_ns)
-            ready = [bool(queue) and queue[0].at_ns <= now_ns for queue in self._queues]
-            for index in self._senders(ready, now_ns):
-                silent = RadioMessage(index + 1, "", self._slot, 0, now_ns, np.zeros(len(ready), np.bool_))
-                self._begin(now_ns, self._queues[index].popleft() if ready[index] else silent)
-            self._slot += 1
+    @property
+    def _next_ns(self) -> int:
+        """When the next slot begins, or the next radio."""
+        return self._slot * self.config.slot_ns if self._slotted else min(self._begin_ns)
+
+    def _begin_slot(self, now_ns: int) -> None:
+        self._resolve(now_ns)
+        ready = [bool(queue) and queue[0].at_ns <= now_ns for queue in self._queues]
+        for index in self._senders(ready, now_ns):
+            silent = RadioMessage(index + 1, "", self._slot, 0, now_ns, np.zeros(len(ready), np.bool_))
+            self._begin(now_ns, self._queues[index].popleft() if ready[index] else silent)
+        self._slot += 1
 
     def _senders(self, ready: list[bool], now_ns: int) -> tuple[int, ...]:
         """Return the senders of the slot that begins now, indices; under lease also some with nothing to send."""
         slot, agents = self._slot, len(ready)
         if self._swarm is not None:
-            for header, received in self._received_headers:
-                self._swarm.hear(slot - 1, header, received.astype(np.uint8))
-            self._received_headers.clear()
             if slot:
                 self._swarm.end(slot - 1)
             # Agents that have something to send are far from their goals; not to change with each message, two rounds.
@@ -175,20 +175,18 @@ class Transport:
             urgency = np.linalg.norm(np.nan_to_num(self._positions) - self._sent_positions, axis=0)
         return (int(np.where(ready, urgency, -np.inf).argmax()),) if any(ready) else ()
 
-    def _run_radios(self, until_ns: int) -> None:
-        """Radios begin as soon as they can; under csma they listen first, and wait longer or give up at a busy air."""
-        while (now_ns := min(self._begin_ns)) <= until_ns:
-            index = self._begin_ns.index(now_ns)
-            message = self._queues[index][0]
-            if self.config.access != "csma" or not self._air.busy(index + 1, now_ns, self._positions):
-                self._begin(max(now_ns, message.at_ns), message)
-            elif self._backoffs[index] < _MAX_BACKOFFS:
-                self._schedule(index, now_ns + 1, self._backoffs[index] + 1)
-                continue
-            else:
-                self.counts["dropped"][index] += message.receivers
-            self._queues[index].popleft()
-            self._schedule(index, now_ns)
+    def _begin_radio(self, index: int, now_ns: int) -> None:
+        """Let a radio begin its message; under csma it listens first, and waits longer or gives up at a busy air."""
+        message = self._queues[index][0]
+        if self.config.access != "csma" or not self._air.busy(index + 1, now_ns, self._positions):
+            self._begin(max(now_ns, message.at_ns), message)
+        elif self._backoffs[index] < _MAX_BACKOFFS:
+            self._schedule(index, now_ns + 1, self._backoffs[index] + 1)
+            return
+        else:
+            self.counts["dropped"][index] += message.receivers
+        self._queues[index].popleft()
+        self._schedule(index, now_ns)
 
     def _schedule(self, index: int, from_ns: int = 0, backoffs: int = 0) -> None:
         """Say when a radio begins, or listens for, the next message that it has."""
@@ -205,11 +203,11 @@ class Transport:
     def _begin(self, start_ns: int, message: RadioMessage) -> None:
         """Put a message on the air, behind a header under lease."""
         index, length = message.sender - 1, self._header_length + message.length
-        header = self._swarm.frame(index) if self._swarm else b""
         if self.config.access == "unlimited":
-            arrival_ns = start_ns + self._airtime.total_ns(length) + self._airtime.from_radio_ns(length)
-            self._account(message, self._medium.reach(message.sender, self._positions), start_ns, arrival_ns)
+            end_ns = start_ns + self._airtime.total_ns(length)
+            self._account(message, None, start_ns, end_ns + self._airtime.from_radio_ns(length))
             return
+        header = self._swarm.frame(index) if self._swarm else b""
         self._air.begin((message, header), message.sender, start_ns, length)
         self._free_ns[index] = start_ns + self._airtime.total_ns(length)
         if self._positions is not None:
@@ -220,15 +218,17 @@ class Transport:
             message, header = verdict.frame_id
             received = self._account(message, verdict.received, verdict.start_ns, verdict.arrival_ns)
             if self._swarm is not None:
-                self._received_headers.append((header, received))
+                self._swarm.hear(self._slot - 1, header, received.view(np.uint8))
 
-    def _account(self, message: RadioMessage, clear: Mask, start_ns: int, arrival_ns: int) -> Mask:
-        """Count a message that has left the air, ``clear`` of collisions at some agents, (N,), and let it arrive.
+    def _account(self, message: RadioMessage, undisturbed: Mask | None, start_ns: int, arrival_ns: int) -> Mask:
+        """Count a message that has left the air, and let it arrive; return the agents that received it, (N,).
 
-        Return the agents that received it, addressed or not, (N,).
+        ``undisturbed``: agents in reach where it did not collide, (N,); None: all in reach.
         """
-        row, receivers = message.sender - 1, message.receivers
-        reach, noise = self._medium.reach(message.sender, self._positions), self._lost(message)
+        row, receivers, medium = message.sender - 1, message.receivers, self._medium_of(message.topic)
+        reach = medium.reach(message.sender, self._positions)
+        clear = reach if undisturbed is None else undisturbed
+        noise = medium.losses.lost(message.number, message.sender)
         received: Mask = receivers & clear & ~noise
         arrival_ns += round(self.config.delay_ms * 1e6)
         for name, values in (
@@ -242,11 +242,9 @@ class Transport:
             self._arriving.add(arrival_ns, (message, received))
         return clear & ~noise
 
-    def _lost(self, message: RadioMessage) -> Mask:
-        """Return which agents lose a message to noise, (N,)."""
-        losses = self._noise.get(message.topic)
-        if losses is None:
-            digest = hashlib.sha256(f"{self.config.seed} {message.topic}".encode()).digest()
-            config = replace(self.config, seed=int.from_bytes(digest[:8], "little") >> 1)
-            losses = self._noise[message.topic] = Losses(config)
-        return losses.lost(message.number, message.sender)
+    def _medium_of(self, topic: str) -> Medium:
+        """Return the medium as messages of a topic find it: noise is drawn for each topic."""
+        if topic not in self._media:
+            digest = hashlib.sha256(f"{self.config.seed} {topic}".encode()).digest()
+            self._media[topic] = Medium(replace(self.config, seed=int.from_bytes(digest[:8], "little") >> 1))
+        return self._media[topic]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from importlib import import_module
 from itertools import groupby
 from typing import Any
+
+from dtsa_agent.core.errors import ConfigError
 
 SWARM = "/swarm"  # namespace of what the whole swarm shares
 FRAME = "map"  # the room's centre, ENU
@@ -76,3 +79,14 @@ def agent_names(ids: Iterable[int]) -> str:
     rows = [list(group) for _, group in groupby(enumerate(sorted(ids)), lambda item: item[1] - item[0])]
     ends = [(row[0][1], row[-1][1]) for row in rows]
     return ", ".join(f"cf{a}" if a == b else f"cf{a} .. cf{b}" for a, b in ends) or "no agent"
+
+
+def message_class(name: str) -> Any:
+    """Return the class of a message type, ``package/msg/Name``; a ConfigError if its package is not installed."""
+    package, _, class_name = name.partition("/msg/")
+    try:
+        message_type = getattr(import_module(f"{package}.msg"), class_name)
+        message_type.__class__.__import_type_support__()
+    except Exception as error:  # what an incomplete package raises has no common base
+        raise ConfigError("type", name, f"an installed message type ({error})") from None
+    return message_type

@@ -35,8 +35,7 @@ from dtsa_bench.pages.view.process import PageOptions, view_process
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_bench.runs.options import new_directory, whole_number
-from dtsa_bench.runs.processes import end_process
-from dtsa_bench.runs.program import program
+from dtsa_bench.runs.program import end_process, program
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel

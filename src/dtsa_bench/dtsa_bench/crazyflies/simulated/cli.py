@@ -14,7 +14,7 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.priority import set_realtime
-from dtsa_bench.runs.options import add_options, given_options, whole_number
+from dtsa_bench.runs.options import add_options, option_values, whole_number
 
 from .fleet import Fleet
 from .fleet_config import FleetConfig, RadioAddress, RadioSettings
@@ -66,8 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def fleet_config(args: argparse.Namespace) -> FleetConfig:
     """Configuration from the command line."""
-    radio = RadioSettings(**given_options(args, RadioSettings, "radio"), path=args.simulated_radio)
-    options = {**given_options(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
+    radio = RadioSettings(**option_values(args, RadioSettings, "radio"), path=args.simulated_radio)
+    options = {**option_values(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
     if args.dongles_only:
         if radio.path is None or args.config is not None:
             raise ConfigError("dongles_only", True, "with --simulated-radio SOCKET, and without --config")
@@ -109,7 +109,7 @@ def request_fault(args: argparse.Namespace) -> None:
         raise ConfigError("cf", args.cf, "an id, or all")
     cf = args.cf if args.cf == "all" else int(args.cf)
     given = {name: getattr(args, name) for name in (*NUMBERS, "direction") if getattr(args, name) is not None}
-    port = FleetConfig(**given_options(args, FleetConfig, "fleet")).control_port
+    port = FleetConfig(**option_values(args, FleetConfig, "fleet")).control_port
     send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **given)
     print(f"{args.fault}: cf {args.cf}")
 

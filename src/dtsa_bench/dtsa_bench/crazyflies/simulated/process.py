@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_bench.runs.processes import end_process
+from dtsa_bench.runs.program import end_process
 
 FIRST = 19850  # where cflib's scan looks, too
 LAST = 32000  # below Linux's ephemeral ports

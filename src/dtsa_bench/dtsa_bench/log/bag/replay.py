@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection
-from importlib import import_module
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.cdr import SECOND
+from dtsa_agent.ros.common.names import message_class
 
 from . import schema
 from .errors import BagError
@@ -116,9 +116,8 @@ class RosOutput:
                 if not topic.encoding.startswith("cdr/"):
                     raise BagError(f"recorded as {topic.encoding}, not as cdr")
                 installed = schema.installed(topic.type)
-                package, _, name = topic.type.split("/")
-                kind = getattr(import_module(f"{package}.msg"), name)
-            except (BagError, ImportError, AttributeError) as error:
+                message_type = message_class(topic.type)
+            except (BagError, ConfigError) as error:
                 warn(f"{topic.name} is left out: {error}")
                 continue
             if topic.type_hash not in ("", installed.type_hash):
@@ -126,7 +125,7 @@ class RosOutput:
                 raise BagError(f"{topic.name}: the bag's {topic.type} differs from the installed one {hashes}")
             try:
                 profile = ros_profile(topic.profiles, topic.count)
-                self._publishers[topic.name] = node.create_publisher(kind, topic.name, profile)
+                self._publishers[topic.name] = node.create_publisher(message_type, topic.name, profile)
             except NameValidationException:
                 allowed = "a name of ROS 2: letters, digits, _ and / alone; leave it out with --topics"
                 raise ConfigError("topic", topic.name, allowed) from None

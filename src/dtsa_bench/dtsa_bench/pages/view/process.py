@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_bench.runs.processes import end_process
+from dtsa_bench.runs.program import end_process
 
 _START_S = 30.0
 _END_S = 5.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, TypedDict
 
-
 class RunSettings(TypedDict, total=False):
     """Units and ranges: docs/reference/settings.md and docs/reference/channel.md."""
 
