@@ -21,12 +21,12 @@ from dtsa_bench.log.bag.reader import Bag
 from .arrays import DECIDED, PRESENT, UNKNOWN, VECTORS, ReceivedFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
 
-SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
+SLOT_RECORD, TYPE = f"{names.SWARM}/{names.SLOT_RECORD}", "dtsa_msgs/msg/SlotRecord"
 CONFIGURATION = "dtsa_msgs/msg/Configuration"
 _HEADER = "std_msgs/msg/Header"
 FORMAT, FORMAT_KEY = "2", "format"  # of bags, and its name in custom data
 AGENT, SNIFFER = "agent", "sniffer"  # custom data: what the record of one agent, or of a listener, says of itself
-_OF_FORMAT_1 = {f"{names.SWARM}/{topic}" for topic in (names.RECEPTION, names.TRANSMISSION, names.DECISION)}
+_OF_FORMAT_1 = {f"{names.SWARM}/{topic}" for topic in ("reception", "transmission", "decision")}
 _KINDS = {
     "agent": "u2", "presence": "u1", "chosen": "u2", "reason": "u1", "digest": "u4", "score": "f8", "offset_ns": "i8",
     "track": "f8", "velocity": "f8", "command": "f8", "goal": "f8", "sender": "u2", "length": "u1", "data": "u1",
