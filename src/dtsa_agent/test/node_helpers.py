@@ -84,8 +84,7 @@ class ServedNode:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         self.node = _made(domain, name)
         self._clients: dict[str, Client] = {}
-        self._serving = ExecutorThread(self.node.context, name, self.node)
-        self._serving.start()
+        self._serving = ExecutorThread(self.node, name)
 
     def client(self, kind: Any, name: str) -> Client:
         if name not in self._clients:

@@ -127,14 +127,14 @@ def _body(stop: Stop, supervised: bool) -> None:
     publisher = node.create_publisher(UInt32, _ANSWER, names.lockstep_qos())
     loop = Loop(node, UInt32, _ASK, names.lockstep_qos())
 
-    def answer(message: UInt32) -> bool:
-        if message.data == _OVER:
-            return False
-        publisher.publish(message)
-        return True
-
     try:
-        loop.run(answer, lambda: None, stop)
+        while not stop:
+            message = loop.wait()
+            if message is not None:
+                if message.data == _OVER:
+                    return
+                publisher.publish(message)
+            loop.housekeeping()
     finally:
         loop.close()
 

@@ -22,7 +22,7 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
 from dtsa_agent.ros.common import checks, names
 from dtsa_agent.ros.common.cdr import POSE_COVARIANCE, TWIST_COVARIANCE
-from dtsa_agent.ros.common.checks import BadMessage, Intake, PublisherGuard
+from dtsa_agent.ros.common.checks import BadMessage, Intake
 from dtsa_agent.ros.common.loop import Loop
 from dtsa_agent.ros.common.messages import SLOT, Fields, header_of
 from dtsa_agent.ros.common.runs import Call, Patience, WaitingLog, run_text
@@ -42,7 +42,7 @@ _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the la
 @dataclass(slots=True)
 class _Caller:
     call: Call
-    publisher: PublisherGuard
+    sender: bytes | None  # of its messages
     introductions: int = 0  # on calls of a run under way
 
 
@@ -62,8 +62,8 @@ class AgentsNode(ABC):
         self.slot = -1  # the last slot that has begun here
         self.run_id = 0  # 0: none has begun yet
         self.intake = Intake(node.get_logger())
-        self._odometry: list[tuple[int, Publisher, str]] = []  # place among those here, frame of the body
-        self._watched: list[tuple[int, Publisher, str]] = []  # those of them with subscribers
+        self._odometry: list[tuple[Publisher, str]] = []  # of each agent, and the frame of its body
+        self._watched: dict[int, tuple[Publisher, str]] = {}  # those of them with subscribers, by place
         self._waiting = WaitingLog(node.get_logger())
         self._has_begun = False
         self._callers: dict[int, _Caller] = {}  # by run
@@ -80,11 +80,11 @@ class AgentsNode(ABC):
         }  # fmt: skip
         self._processes = node.create_publisher(Process, f"{swarm_namespace}/{names.PROCESS}", names.lockstep_qos())
         qos, topic = names.lockstep_qos(max(waiting, _OTHER_MESSAGES // 4)), f"{swarm_namespace}/{names.SLOT}"
-        self.loop = Loop(node, Slot, topic, qos, intake=self.intake, admits=self._admits, read=SLOT.read_fields)
+        self.loop = Loop(node, Slot, topic, qos, intake=self.intake, check=self._check, read=SLOT.read_fields)
 
     @abstractmethod
-    def run(self, stop: Stop) -> None:
-        """Fly until the run is over or a signal comes."""
+    def _serve(self) -> bool:
+        """Wait a moment for the next thing to do, and do it; return False when the run is over."""
 
     @abstractmethod
     def _dropped_frames(self) -> dict[str, int]:
@@ -94,16 +94,27 @@ class AgentsNode(ABC):
     def _check_next(self, message: Fields) -> None:
         """Raise BadMessage for a slot message that cannot be the next one."""
 
+    def run(self, stop: Stop) -> None:
+        """Fly until the run is over or a signal comes; in real time, agents of policy ``lease`` first announce that.
+
+        :raises ConfigError: the channel refuses this process, or its agents cannot come into a flight under way.
+        :raises LocalProtocolError: the channel has gone without ending the run.
+        """
+        while not self._has_ended(stop) and self._serve():
+            if self.loop.housekeeping():
+                self._check_graph()
+
+    def _has_ended(self, stop: Stop) -> bool:
+        """Whether to end now because of a signal."""
+        return bool(stop)
+
     def close(self) -> None:
         """Let the last counts arrive before this process ends: what it has published goes with it."""
         self._processes.wait_for_all_acked(_DELIVERY)
         self.loop.close()
 
-    def idle(self) -> None:
-        """Look around, about ten times a second; log what is waited for, and that slot 0 has begun.
-
-        :raises LocalProtocolError: when the channel has gone without ending the run.
-        """
+    def _check_graph(self) -> None:
+        """Log what is waited for, and that slot 0 has begun; LocalProtocolError: the channel has gone."""
         subscription = self.loop.subscription
         publishers = subscription.get_publisher_count()
         if self.run_id:
@@ -114,7 +125,7 @@ class AgentsNode(ABC):
         elif not self._has_begun:
             self._has_begun = True
             self.node.get_logger().info(f"slot 0 has begun: run {run_text(self.run_id)}")
-        self._watched = [entry for entry in self._odometry if entry[1].get_subscription_count()]
+        self._watched = {at: entry for at, entry in enumerate(self._odometry) if entry[0].get_subscription_count()}
 
     def _check_channel(self, publishers: int) -> None:
         self._publish_counts()
@@ -127,19 +138,12 @@ class AgentsNode(ABC):
 
     # Messages of the channel.
 
-    def _admits(self, message: Fields, sender: bytes | None) -> bool:
-        """Whether a slot message is one of this run; others are counted. A channel that calls is answered.
-
-        ConfigError: the channel refuses this process.
-        """
-        try:
-            self._check(message, sender)
-        except BadMessage as error:
-            self.intake.drop(error.reason, str(error))
-            return False
-        return True
-
     def _check(self, message: Fields, sender: bytes | None) -> None:
+        """Check that a slot message is one of this run. A channel that calls is answered.
+
+        :raises BadMessage: it is not.
+        :raises ConfigError: the channel refuses this process.
+        """
         checks.check_slot(message, self.config.agents)
         run, phase = message.run, message.phase
         calls = phase in (Slot.PREPARE, Slot.START)
@@ -157,7 +161,7 @@ class AgentsNode(ABC):
             self._publish_counts()
             return
         self._check_next(message)
-        if not caller.publisher.admits(time.monotonic(), sender):
+        if sender != caller.sender:
             raise BadMessage(checks.OTHER_SENDER, f"a slot message of run {run_text(run)}, not of its channel")
         if phase == Slot.REFUSE:
             self._read_refusal(message.data)
@@ -173,7 +177,7 @@ class AgentsNode(ABC):
             raise BadMessage(checks.RANGE, f"an unreadable call: {error}") from None
         while len(self._callers) >= _MOST_CALLERS:
             del self._callers[next(run for run in self._callers if run != self.run_id)]
-        caller = self._callers[run] = _Caller(call, PublisherGuard(sender))
+        caller = self._callers[run] = _Caller(call, sender)
         return caller
 
     def _begin_run(self, run: int) -> int:
@@ -214,18 +218,20 @@ class AgentsNode(ABC):
 
     def offer_odometry(self, namespaces: Sequence[str]) -> None:
         """Offer each agent's true motion as ``odom`` in its namespace; published only while a node subscribes."""
-        for index, space in enumerate(namespaces):
+        for space in namespaces:
             topic = f"{space.rstrip('/')}/{names.ODOMETRY}"
             publisher = self.node.create_publisher(Odometry, topic, _ODOMETRY_DEPTH)
-            self._odometry.append((index, publisher, names.body_frame(space)))
+            self._odometry.append((publisher, names.body_frame(space)))
 
-    def _publish_odometry(self, entry: tuple[int, Publisher, str], swarm: Swarm, column: int, slot: int) -> None:
-        """Publish the position of an agent, in a column of a swarm, at the start of a slot."""
+    def _publish_odometry(self, index: int, swarm: Swarm, column: int, slot: int) -> None:
+        """Publish where an agent, by its place here and a column of its swarm, is at the start of a slot, if asked."""
+        if index not in self._watched:
+            return
+        publisher, body = self._watched[index]
         # The attitude is not modelled, it is the identity: the body's axes are those of the map.
-        header = header_of(names.slot_time_ns(slot, self.config.slot_ns))
-        message = Odometry(header=header, child_frame_id=entry[2])
+        message = Odometry(header=header_of(names.slot_time_ns(slot, self.config.slot_ns)), child_frame_id=body)
         message.pose.covariance, message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
         place, speed = message.pose.pose.position, message.twist.twist.linear
         place.x, place.y, place.z = swarm.position[:, column].tolist()
         speed.x, speed.y, speed.z = swarm.velocity[:, column].tolist()
-        entry[1].publish(message)
+        publisher.publish(message)

@@ -15,7 +15,6 @@ from dtsa_msgs.msg import VelocityWorld
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
@@ -27,8 +26,9 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.declaration import Setting, Settings, setting, settings_of
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.checks import OTHER_SENDER, RANGE, BadMessage, Intake, PublisherGuard, check_odometry
-from dtsa_agent.ros.common.loop import HOUSEKEEPING_S, Feed
+from dtsa_agent.ros.common.cdr import ns_of
+from dtsa_agent.ros.common.checks import OTHER_SENDER, RANGE, BadMessage, Intake, check_odometry
+from dtsa_agent.ros.common.loop import Loop
 from dtsa_agent.ros.common.parameters import check_parameters, declare_setting, declare_settings
 from dtsa_agent.stop import Stop
 
@@ -39,10 +39,11 @@ _RECORDERS = "dtsa.recorders"  # group of entry points: what records is in a pac
 SIMULATED, ODOMETRY = "simulated", "odometry"
 BODY, MAP = "body", "map"
 TWIST, VELOCITY_WORLD = "twist", "velocity_world"
-_LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LONGEST_PREDICTION_S = 0.15
+_SILENT_S = 0.3  # after such a silence another publisher may take over
 _SLACK_M = 0.5  # odometry may be off by this from one message to the next
-_HOLD_GAIN, _HOLD_MPS = 1.0, 0.3  # 1/s, m/s: of an agent that hovers
+HOLD_GAIN, HOLD_MPS = 1.0, 0.3  # 1/s, m/s: of an agent that hovers: real air does not leave it where it is
 _STOPS, _STOPS_S = 5, 0.1  # how often an agent that ends tells its vehicle to stop, within which time
 
 
@@ -73,28 +74,82 @@ class VehicleSettings(Settings):
     )
 
 
-class OdometryVehicle(AgentVehicle):
-    """A vehicle that publishes odometry and follows velocities.
+class VehicleOdometry:
+    """The newest odometry of a vehicle that can be.
 
-    Odometry that cannot be, or lies where the vehicle cannot have got since the last accepted one, is counted and not
-    used. Without any for a while the vehicle gets the velocity 0, and its agent sends that it stands.
+    What cannot be, or lies where the vehicle cannot have got since the last accepted one, is counted and not used.
+
+    :param intake: counts what is not used.
+    :param frame: of the messages whose origin is that of the settings, others are in the map; empty: all.
+    :param is_stamped: stamps are of this machine's clock: they say how old the odometry is, not when it came.
     """
+
+    def __init__(
+        self, node: Node, settings: VehicleSettings, intake: Intake, frame: str = "", is_stamped: bool = False
+    ) -> None:
+        self._settings, self._frame, self._is_stamped = settings, frame, is_stamped
+        self._sender: bytes | None = None  # of the last accepted one
+        self._came_s = -math.inf  # s, monotonic: when that came
+        self._measured_s = 0.0  # when its vehicle was there
+        self._position = self._velocity = np.zeros(3)  # m, m/s, map: of the same
+        self.attitude = (0.0, 0.0, 0.0, 1.0)  # of the same, x, y, z, w
+        self.feed = Loop(node, Odometry, settings.odometry_topic, LATEST, intake=intake, check=self._accept)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether any has been accepted."""
+        return self._came_s > 0.0
+
+    @property
+    def is_fresh(self) -> bool:
+        """Whether the last accepted one came just now."""
+        return time.monotonic() - self._came_s < self._settings.stale_s
+
+    def sense(self, swarm: Swarm) -> None:
+        """Write the newest odometry, moved on by its age, into an agent; without any for a while the agent stands."""
+        self.feed.take()
+        if not self.is_fresh:
+            swarm.velocity[:, 0] = 0.0
+            return
+        swarm.velocity[:, 0] = self._velocity
+        # What was measured is as old as it is: a vehicle at 1 m/s has moved on by centimetres since.
+        age_s = min(time.monotonic() - self._measured_s, _LONGEST_PREDICTION_S)
+        swarm.position[:, 0] = self._position + self._velocity * age_s
+        swarm.track[:, :, 0] = swarm.position[:, 0]
+
+    def _accept(self, message: Odometry, sender: bytes | None) -> None:
+        check_odometry(message)
+        now, fastest = time.monotonic(), self._settings.fastest_mps
+        if sender != self._sender and now - self._came_s < _SILENT_S:
+            raise BadMessage(OTHER_SENDER, f"{self._settings.odometry_topic} from two publishers")
+        place, speed, q = message.pose.pose.position, message.twist.twist.linear, message.pose.pose.orientation
+        position = np.array((place.x, place.y, place.z))
+        if self._frame in ("", message.header.frame_id):
+            position += self._settings.odometry_origin
+        velocity, attitude = np.array((speed.x, speed.y, speed.z)), (q.x, q.y, q.z, q.w)
+        if self._settings.twist_frame == BODY:
+            velocity = rotate(attitude, velocity)
+        if math.hypot(*velocity) > fastest:
+            raise BadMessage(RANGE, f"odometry of more than {fastest:g} m/s")
+        if math.dist(position, self._position) > _SLACK_M + fastest * (now - self._came_s):
+            raise BadMessage(RANGE, "odometry that has jumped")
+        age_s = time.time() - ns_of(message.header.stamp) / 1e9 if self._is_stamped else 0.0
+        self._sender, self._came_s, self._measured_s = sender, now, now - min(max(0.0, age_s), _LONGEST_PREDICTION_S)
+        self._position, self._velocity, self.attitude = position, velocity, attitude
+
+
+class OdometryVehicle(AgentVehicle):
+    """A vehicle that publishes odometry and follows velocities; without odometry for a while it gets the velocity 0."""
 
     def __init__(self, node: Node, settings: VehicleSettings, slot_s: float) -> None:
         self._settings, self._node = settings, node
         self._every = max(1, round(1.0 / settings.command_hz / slot_s))
         self._frame = names.FRAME if settings.command_frame == MAP else names.body_frame(node.get_namespace())
-        self.intake = Intake(node.get_logger())
-        self._last: tuple[float, Any, Any] | None = None  # s, monotonic; m, m/s, map: last accepted
-        self._attitude = (0.0, 0.0, 0.0, 1.0)  # of the same, x, y, z, w
         self._hold: Any = None  # m, map: where it was when it began to hover
         self._kind = TwistStamped if settings.command_type == TWIST else VelocityWorld
         self._publisher = node.create_publisher(self._kind, settings.command_topic, 1)
-        self._feed = Feed(node, Odometry, settings.odometry_topic, _LATEST, intake=self.intake)
-        self._guard = PublisherGuard()  # of the odometry
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(node)
-        self._next_service_s = 0.0
+        self._intake = Intake(node.get_logger())
+        self._odometry = VehicleOdometry(node, settings, self._intake)
 
     def close(self) -> None:
         """Stop the vehicle: the agent has ended.
@@ -108,84 +163,45 @@ class OdometryVehicle(AgentVehicle):
                 time.sleep(_STOPS_S / _STOPS)
             self._publisher.wait_for_all_acked(Duration(seconds=_STOPS_S))
         finally:
-            self._feed.close()
-            self._executor.shutdown(timeout_sec=0)
+            self._odometry.feed.close()
 
     def is_ready(self) -> bool:
         """Whether odometry has come, and is fresh."""
-        self._update()
-        return self._fresh() is not None
+        self._odometry.feed.take()
+        self._odometry.feed.housekeeping()
+        return self._odometry.is_fresh
 
     @property
     def why_unknown(self) -> str:
         """Why it was never known where the vehicle is; empty: it was."""
-        if self._last is not None:
+        if self._odometry.is_known:
             return ""
-        refused = ", ".join(f"{number} refused ({reason})" for reason, number in self.intake.counts.items())
+        refused = ", ".join(f"{number} refused ({reason})" for reason, number in self._intake.counts.items())
         return refused or f"none came on {self._settings.odometry_topic}"
 
-    def _fresh(self) -> tuple[float, Any, Any] | None:
-        last = self._last
-        return last if last is not None and time.monotonic() - last[0] < self._settings.stale_s else None
-
-    def _update(self) -> None:
-        """Accept what has come, and serve the node's parameters."""
-        message = self._feed.take()
-        if message is not None:
-            with self.intake.guard():
-                self._accept(message)
-        if time.monotonic() >= self._next_service_s:
-            self._next_service_s = time.monotonic() + HOUSEKEEPING_S
-            self._executor.spin_once(timeout_sec=0.0)
-
-    def _accept(self, message: Odometry) -> None:
-        check_odometry(message)
-        now, fastest = time.monotonic(), self._settings.fastest_mps
-        if not self._guard.admits(now, self._feed.sender):
-            raise BadMessage(OTHER_SENDER, "odometry from two publishers")
-        place, speed, q = message.pose.pose.position, message.twist.twist.linear, message.pose.pose.orientation
-        position = np.array((place.x, place.y, place.z)) + self._settings.odometry_origin
-        velocity, attitude = np.array((speed.x, speed.y, speed.z)), (q.x, q.y, q.z, q.w)
-        if self._settings.twist_frame == BODY:
-            velocity = rotate(attitude, velocity)
-        if math.hypot(*velocity) > fastest:
-            raise BadMessage(RANGE, f"odometry of more than {fastest:g} m/s")
-        if self._last is not None and math.dist(position, self._last[1]) > _SLACK_M + fastest * (now - self._last[0]):
-            raise BadMessage(RANGE, "odometry that has jumped")
-        self._last, self._attitude = (now, position, velocity), attitude
-
     def sense(self, swarm: Swarm) -> None:
-        """Write the newest odometry, moved on by its age, into the agent."""
-        self._update()
-        fresh = self._fresh()
-        if fresh is None:
-            swarm.velocity[:, 0] = 0.0
-            return
-        since, position, velocity = fresh
-        swarm.velocity[:, 0] = velocity
-        # What was measured is as old as it is: a vehicle at 1 m/s has moved on by centimetres since.
-        swarm.position[:, 0] = position + velocity * min(time.monotonic() - since, _LONGEST_PREDICTION_S)
-        swarm.track[:, :, 0] = swarm.position[:, 0]
+        self._odometry.sense(swarm)
+        self._odometry.feed.housekeeping()
 
     def fly(self, swarm: Swarm, slot: int) -> None:
         """Publish the velocity for a slot: the agent's command, or one that holds the vehicle."""
         if slot % self._every:
             return
         swarm.steer(slot, 0)
-        if self._fresh() is None:
+        if not self._odometry.is_fresh:
             swarm.command[:, 0] = 0.0
         elif swarm.active[0]:
             self._hold = None
         else:
             if self._hold is None:
                 self._hold = swarm.position[:, 0].copy()
-            swarm.command[:, 0] = np.clip(_HOLD_GAIN * (self._hold - swarm.position[:, 0]), -_HOLD_MPS, _HOLD_MPS)
+            swarm.command[:, 0] = velocity_to(self._hold - swarm.position[:, 0])
         self._command(swarm.command[:, 0])
 
     def _command(self, velocity: Any) -> None:
         """Publish a velocity, (3,) m/s, map."""
         if self._settings.command_frame == BODY:
-            x, y, z, w = self._attitude
+            x, y, z, w = self._odometry.attitude
             velocity = rotate((-x, -y, -z, w), velocity)
         message = self._kind()
         if self._kind is TwistStamped:
@@ -195,6 +211,11 @@ class OdometryVehicle(AgentVehicle):
         message.header.stamp = self._node.get_clock().now().to_msg()
         speed.x, speed.y, speed.z = map(float, velocity)
         self._publisher.publish(message)
+
+
+def velocity_to(away: Any) -> Any:
+    """Return the velocity, m/s, of vehicles that hover and are so far, m, from where they shall be."""
+    return np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
 
 
 def rotate(q: tuple[float, float, float, float], v: Any) -> Any:

@@ -16,15 +16,16 @@ from __future__ import annotations
 
 import os
 import time
-from array import array
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from dtsa_msgs.msg import Frame, Report, Slot
 from rclpy.duration import Duration
 from rclpy.node import Node
 
+from dtsa_agent.air.driver import AgentVehicle
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core import station as core
 from dtsa_agent.core.agent import REFUSED
@@ -37,7 +38,7 @@ from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import split_frames, unpack_received
 from dtsa_agent.ros.common.checks import SIZES, SLOT, BadMessage, check_start
-from dtsa_agent.ros.common.messages import Fields, header_of
+from dtsa_agent.ros.common.messages import FRAME, Fields
 from dtsa_agent.stop import Stop
 
 from .agents_node import AgentsNode
@@ -54,8 +55,7 @@ _BURST = 64  # messages received at a time: whatever comes, the own slots go on
 class RealtimeAgent:
     """A station, its clock, and a radio that sends when the slot begins what is ready by then.
 
-    All times but the station's own are ns on the channel's time line, from the start of slot 0; for the clock,
-    CLOCK_MONOTONIC stands for it.
+    All times but the station's own are ns of CLOCK_MONOTONIC.
 
     :param index: place among the agents here.
     :param jitter_ns: standard deviation of the time of a single transmission.
@@ -67,59 +67,59 @@ class RealtimeAgent:
     ) -> None:  # fmt: skip
         self.id, self.clock = id, clock
         self.swarm = make_swarm(config, scenario, local=[id])
+        self.vehicle = AgentVehicle()
         self.slot = -1  # the present one
         self.start_ns = 0  # of its slot, or of the transmission in it
         self.frame = b""  # that it sends in this slot
         self.due_ns = _NEVER
         self.refusals: Counter[str] = Counter()  # frames, by reason; empty: because of their content
-        self._index, self._reporter = index, reporter
+        self.index, self._reporter = index, reporter
         self._slot_ns, self._jitter_ns = config.slot_ns, jitter_ns
         self._random = generator(config.seed, STREAM_CLOCKS, id)
-        self._zero = self._start_ns = 0
         self._opened = False
 
     def begin(self, settings: StationSettings, zero: int) -> None:
         """Take part from now on; ``zero``: CLOCK_MONOTONIC at the start of slot 0."""
-        self._zero = zero
-        self.due_ns = self._now()
-        self.station = Station(self.swarm, settings, self.clock.local_ns(self.due_ns), None, self)
-
-    def _now(self) -> int:
-        return time.monotonic_ns() - self._zero
+        self.clock, self.due_ns = replace(self.clock, began_ns=zero), time.monotonic_ns()
+        senses = type(self.vehicle).sense is not AgentVehicle.sense
+        sense = (lambda slot: self.vehicle.sense(self.swarm)) if senses else None
+        self.station = Station(self.swarm, settings, self.clock.local_ns(self.due_ns), sense, self)
 
     def receive(self, frame: bytes, arrival_ns: int) -> None:
         """A frame has arrived."""
         self.station.receive(frame, self.clock.local_ns(arrival_ns))
-        self.due_ns = min(self.due_ns, self._now())
+        self.due_ns = min(self.due_ns, time.monotonic_ns())
 
     def step(self) -> bool:
         """Do what is due now; return True if a slot is open, in which it may send a :attr:`frame`."""
-        self._opened, shown = False, self.clock.local_ns(self._now())
-        due, _ = self.station.step(shown)
+        self._opened, station, clock = False, self.station, self.clock
+        due, _ = station.step(clock.local_ns(time.monotonic_ns()))
         if self._opened:
-            self._send()
-            shown = self.clock.local_ns(self._now())
+            self.slot = station.slot
+            start = station.slot_start_ns(self.slot)
+            self._send(start)
+            shown = clock.local_ns(time.monotonic_ns())
             # Not yet the next slot: this one comes first.
-            due = self.station.step(shown)[0] if shown < self._start_ns else shown
-        self.due_ns = self.clock.monotonic_ns(due)
+            due = station.step(shown)[0] if shown < start else shown
+        self.due_ns = clock.monotonic_ns(due)
         return self._opened
 
-    def _send(self) -> None:
-        """Hand over the frame that is ready: its transmission begins with the slot, but for jitter, or now."""
-        station, self.frame = self.station, b""
-        self.slot = station.slot
-        self._start_ns = station.slot_start_ns(self.slot)
-        self.start_ns = self.clock.monotonic_ns(self._start_ns)
+    def _send(self, slot_start: int) -> None:
+        """Hand over the frame that is ready: its transmission begins with the slot, but for jitter, or now.
+
+        :param slot_start: by the own clock.
+        """
+        self.start_ns, self.frame = self.clock.monotonic_ns(slot_start), b""
         if not self.swarm.frame_length[0]:
             return
         jitter = int(self._jitter_ns * self._random.standard_normal()) if self._jitter_ns else 0
-        start = max(self.start_ns + jitter, self._now())
+        start = max(self.start_ns + jitter, time.monotonic_ns())
         late = max(0, start - self.start_ns)
         # So late that the next turn would be disturbed: the station keeps it back.
-        sent_ns = self._start_ns + (self._slot_ns if late > self._slot_ns // 2 else late)
-        _, self.frame = station.step(sent_ns)
+        sent = slot_start + (self._slot_ns if late > self._slot_ns // 2 else late)
+        _, self.frame = self.station.step(sent)
         if self.frame:
-            station.sent(sent_ns, True)
+            self.station.sent(sent, True)
             self.start_ns = start
 
     # Events of the station.
@@ -132,7 +132,7 @@ class RealtimeAgent:
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         if accepted:
-            self._reporter.add_received(self._index, sender, slot, self.station.slot)
+            self._reporter.add_received(self.index, sender, slot, self.station.slot)
         else:
             self.refusals[""] += 1
 
@@ -212,21 +212,6 @@ class RealtimeNode(AgentsNode):
 
     # From the call to the end.
 
-    def run(self, stop: Stop) -> None:
-        """Fly until the run is over or a signal comes; with policy ``lease`` agents first announce that they leave.
-
-        :raises ConfigError: in a flight under way that agents of this policy cannot come into.
-        """
-        while not self._has_ended(stop):
-            if not self._zero:
-                message = self.loop.wait()
-                if message is not None and not self._prepare(message):
-                    return
-            elif not self._serve():
-                return
-            if self.loop.housekeeping():
-                self.idle()
-
     def _has_ended(self, stop: Stop) -> bool:
         """Whether to end now because of a signal: the second one, or when all agents here have left after the first."""
         if not stop:
@@ -250,11 +235,14 @@ class RealtimeNode(AgentsNode):
     def _prepare(self, message: Fields) -> bool:
         """Answer the channel's call, or take the start time; return False when the run is over."""
         if message.phase == Slot.PREPARE:
+            if not all(agent.vehicle.is_ready() for agent in self.agents):
+                return True
             self._called = True
             if message.slot > names.FIRST_CALL:
                 self._go_first()
-            for index, agent in enumerate(self.agents):
-                self._reporter.add_slot(index, message.slot, agent.clock.monotonic_ns(0), 0, agent.swarm)
+            for agent in self.agents:
+                agent.vehicle.sense(agent.swarm)
+                self._reporter.add_slot(agent.index, message.slot, agent.clock.monotonic_ns(0), 0, agent.swarm)
             self._reporter.publish(message.run, message.slot)
         elif message.phase == Slot.START and (self._called or self._may_join()):
             self._go_first()
@@ -286,7 +274,7 @@ class RealtimeNode(AgentsNode):
         link = Link(b"", says_late=False, names=0, flight_ns=self._flight_ns, trust_ns=_TRUST_NS)
         for agent in self.agents:
             settings = StationSettings(
-                self.config, link, self._authenticator, agent.id, origin_ns=0, listens=not self._called,
+                self.config, link, self._authenticator, agent.id, origin_ns=zero, listens=not self._called,
                 keeps_time=keeps if self._align else core.KeepsTime.STARTS,
             )  # fmt: skip
             agent.begin(settings, zero)
@@ -296,13 +284,13 @@ class RealtimeNode(AgentsNode):
     # Slots.
 
     def _serve(self) -> bool:
-        """Wait until an agent is due or a message comes; return False when the run is over."""
-        remaining = self._zero + min(agent.due_ns for agent in self.agents) - time.monotonic_ns()
+        if not self._zero:
+            message = self.loop.wait()
+            return message is None or self._prepare(message)
+        remaining = min(agent.due_ns for agent in self.agents) - time.monotonic_ns()
         if remaining > 0:
             message = self.loop.wait(min(remaining, _PATIENCE_NS))
-            if message is None:
-                return True
-            goes_on = self._receive(message)
+            goes_on = message is None or self._receive(message)
             os.sched_yield()  # all agents of this machine hear a frame before any of them goes on
             return goes_on
         for message in (self.loop.take() for _ in range(_BURST)):
@@ -310,57 +298,46 @@ class RealtimeNode(AgentsNode):
                 break
             if not self._receive(message):
                 return False
-        self._sense()
-        now = self._reporter.now_ns = time.monotonic_ns() - self._zero
+        self._step()
+        return True
+
+    def _step(self) -> None:
+        """Let agents do what is due; then report the slots that they have opened, and fly vehicles through them."""
+        now = time.monotonic_ns()
+        self._reporter.now_ns = now - self._zero
         opened = []
-        for index, agent in enumerate(self.agents):
+        for agent in self.agents:
             while agent.due_ns <= now:
                 if agent.step():
-                    opened.append(index)
+                    opened.append(agent)
                     self._send(agent)
                     break
-        if opened:
-            self._fly_on(opened)
-        return True
+        for agent in opened:
+            self.slot = max(self.slot, agent.slot)
+            offset = agent.start_ns - self._zero - agent.slot * self.slot_ns
+            self._reporter.add_slot(agent.index, agent.slot, offset, len(agent.frame), agent.swarm)
+            self._publish_odometry(agent.index, agent.swarm, 0, agent.slot)
+        for agent in opened:
+            agent.vehicle.fly(agent.swarm, agent.slot)
+        complete = min(agent.slot for agent in self.agents if agent.slot >= 0) if opened else -1
+        if self._reporter.is_due(complete):
+            self._reporter.publish(self.run_id, complete)
 
     def _receive(self, message: Fields) -> bool:
         """Hand frames to the agents that receive them; return False when the run is over."""
         if message.phase != Slot.RUN:
             return bool(message.phase != Slot.END)
         self._reporter.now_ns = time.monotonic_ns() - self._zero
+        arrival_ns = self._zero + message.time_ns - names.TIME_ZERO_NS
         received = unpack_received(message.received, len(message.sender), self.config.agents)
         for frame, mask in zip(split_frames(message.data, message.length), received, strict=True):
             for index in np.flatnonzero(mask[self._columns]).tolist():
-                self.agents[index].receive(frame, message.time_ns - names.TIME_ZERO_NS)
+                self.agents[index].receive(frame, arrival_ns)
         return True
 
     def _send(self, agent: RealtimeAgent) -> None:
         """Hand the frame of an agent over to the channel, before anything else is done."""
         if agent.frame:
-            header, data = header_of(names.TIME_ZERO_NS + agent.start_ns), array("B", agent.frame)
-            self._air.publish(Frame(header=header, run=self.run_id, slot=agent.slot, agent=agent.id, data=data))
-
-    def _fly_on(self, opened: Sequence[int]) -> None:
-        """Report the slots that agents, by their places here, have opened, and fly their vehicles through them."""
-        for index in opened:
-            agent = self.agents[index]
-            self.slot = max(self.slot, agent.slot)
-            offset = agent.start_ns - agent.slot * self.slot_ns
-            self._reporter.add_slot(index, agent.slot, offset, len(agent.frame), agent.swarm)
-        for entry in self._watched:
-            if entry[0] in opened:
-                agent = self.agents[entry[0]]
-                self._publish_odometry(entry, agent.swarm, 0, agent.slot)
-        for index in opened:
-            self._fly(index)
-        complete = min(agent.slot for agent in self.agents if agent.slot >= 0)
-        if self._reporter.is_due(complete):
-            self._reporter.publish(self.run_id, complete)
-
-    def _sense(self) -> None:
-        """Write the state of vehicles that fly elsewhere."""
-
-    def _fly(self, index: int) -> None:
-        """Fly the vehicle of an agent through its slot."""
-        agent = self.agents[index]
-        agent.swarm.fly(agent.slot)
+            time_ns = names.TIME_ZERO_NS + agent.start_ns - self._zero
+            fields = {"run": self.run_id, "slot": agent.slot, "agent": agent.id, "data": agent.frame}
+            self._air.publish(FRAME.pack_fields(time_ns, **fields))

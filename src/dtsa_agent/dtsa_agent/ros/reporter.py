@@ -15,11 +15,9 @@ from dtsa_agent.ros.common.messages import REPORT
 
 _PERIOD_NS = 100_000_000
 _MOST_RECEIVED = 1000  # frames that wait to be reported: far more than a swarm sends in one period
-# Fields of an agent's slot: start of the slot or transmission, length of the frame, and arrays of its swarm.
-_KINDS = {"offset_ns": "<i8", "length": "u1", "chosen": "<u2", "reason": "u1", "digest": "<u4", "score": "<f8",
-          "track": "<f8", "velocity": "<f8", "command": "<f8", "goal": "<f8"}  # fmt: skip
-_OF_SWARM = tuple(_KINDS)[2:]
-_RECEIVED_KINDS = {"heard_sender": "H", "heard_slot": "I", "heard_in": "I", "heard_ns": "q"}
+_OF_SWARM = ("chosen", "reason", "digest", "score", "track", "velocity", "command", "goal")
+_OF_SLOT = ("offset_ns", "length", *_OF_SWARM)
+_OF_RECEIVED = ("heard_sender", "heard_slot", "heard_in", "heard_ns")
 
 
 class Reporter:
@@ -71,15 +69,15 @@ class Reporter:
         if self._received and all_agents not in [agents for agents, _ in groups]:
             groups.append((all_agents, []))
         for agents, slots in groups:
-            fields = dict.fromkeys((*_KINDS, *_RECEIVED_KINDS, "heard_by"), b"")
+            fields = dict.fromkeys((*_OF_SLOT, *_OF_RECEIVED, "heard_by"), b"")
             columns = zip(*[ready[row][index] for row in slots for index in agents], strict=True)
-            for (name, kind), column in zip(_KINDS.items(), columns, strict=False):
-                values = np.frombuffer(b"".join(column), kind).reshape(len(slots), len(agents), -1)
+            for name, column in zip(_OF_SLOT, columns, strict=False):
+                values = np.frombuffer(b"".join(column), REPORT.kinds[name]).reshape(len(slots), len(agents), -1)
                 fields[name] = values.transpose(0, 2, 1).tobytes()
             if agents == all_agents:
                 received, self._received = self._received, {}
-                for (name, kind), column in zip(_RECEIVED_KINDS.items(), zip(*received, strict=True), strict=False):
-                    fields[name] = array(kind, column).tobytes()
+                for name, column in zip(_OF_RECEIVED, zip(*received, strict=True), strict=False):
+                    fields[name] = np.array(column, REPORT.kinds[name]).tobytes()
                 width = -(-len(agents) // 8)
                 fields["heard_by"] = b"".join(bits.to_bytes(width, "little") for bits in received.values())
             last = slots[-1] if slots and slots[-1] < names.FIRST_CALL else 0

@@ -44,7 +44,6 @@ _SHARED = Setting(
 class HostSettings(PrioritySettings):
     """How agents live in a process, beside what the whole swarm agrees on."""
 
-    odometry: bool = setting(True, "offer each agent's true motion as <agent>/odom")
     mode: str = setting(
         names.MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own",
         choices=names.MODES,
@@ -91,8 +90,7 @@ def host_agents(
         agents: AgentsNode = SwarmNode(node, with_key(make_swarm(config, local=ids, shared_table=shared)), space)
     else:
         agents = _realtime_node(node, config, ids, space, host)
-    if host.odometry:
-        agents.offer_odometry(spaces)
+    agents.offer_odometry(spaces)
     logger = node.get_logger()
     try:
         check_parameters(node)

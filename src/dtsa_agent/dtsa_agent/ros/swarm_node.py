@@ -14,7 +14,6 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import split_frames, unpack_received
 from dtsa_agent.ros.common.checks import SLOT, BadMessage
 from dtsa_agent.ros.common.messages import TRANSMISSION, Fields
-from dtsa_agent.stop import Stop
 
 from .agents_node import AgentsNode
 
@@ -31,7 +30,6 @@ class SwarmNode(AgentsNode):
     def __init__(self, node: Node, swarm: Swarm, swarm_namespace: str = names.SWARM) -> None:
         self.agents = AgentGroup(swarm)
         self._goal = b""  # as last sent
-        self._no_frames = unpack_received(b"", 0, swarm.config.agents)
         self._agent_ids = array("H", swarm.ids).tobytes()
         self._bytes = b""  # the last answer
         topic = f"{swarm_namespace}/{names.TRANSMISSION}"
@@ -52,11 +50,11 @@ class SwarmNode(AgentsNode):
         if message.phase == Slot.RUN and not 0 <= message.slot - self.slot <= 1:
             raise BadMessage(SLOT, f"slot {message.slot} after slot {self.slot}")
 
-    def run(self, stop: Stop) -> None:
-        self.loop.run(self.on_slot, self.idle, stop)
-
-    def on_slot(self, message: Fields) -> bool:
-        """Answer a slot message; return False when the run is over."""
+    def _serve(self) -> bool:
+        """Answer the next slot message."""
+        message = self.loop.wait()
+        if message is None:
+            return True
         if message.phase != Slot.RUN:
             return bool(message.phase != Slot.END)
         slot = message.slot
@@ -68,16 +66,14 @@ class SwarmNode(AgentsNode):
             if self.config.auth and not self.config.auth_session:
                 self.swarm.begin_session(session)
         else:
-            received, frames = self._no_frames, []
-            if message.length:
-                received = unpack_received(message.received, len(message.length), self.config.agents)
-                frames = split_frames(message.data, message.length)
+            received = unpack_received(message.received, len(message.length), self.config.agents)
+            frames = split_frames(message.data, message.length)
             self.agents.on_frames(slot - 1, message.sender, frames, received)
             self.agents.on_slot_end()
         self._answer(slot, self.agents.on_slot(slot))
         self.slot = slot
-        for entry in self._watched:
-            self._publish_odometry(entry, self.swarm, entry[0], slot)
+        for index in self._watched:
+            self._publish_odometry(index, self.swarm, index, slot)
         self.swarm.fly(slot)
         return True
 

@@ -12,7 +12,8 @@ from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
 from dtsa_agent.core.plugins import PluginSwarm
 from dtsa_agent.core.settings.flight_models import VehicleParams
-from dtsa_agent.crazyflie.node.agents_node import HOLD_GAIN, HOLD_MPS, steer, ways_apart
+from dtsa_agent.crazyflie.node.agents_node import steer, ways_apart
+from dtsa_agent.ros.odometry_vehicle import HOLD_GAIN, HOLD_MPS
 
 KEY = bytes(range(16))
 DECIDED, FLOWN = ("chosen", "reason", "digest", "score"), ("position", "velocity", "command", "track")

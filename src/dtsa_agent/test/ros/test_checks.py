@@ -22,7 +22,7 @@ from dtsa_msgs.msg import Process, Slot
 from nav_msgs.msg import Odometry
 
 from dtsa_agent.ros.common import checks
-from dtsa_agent.ros.common.checks import RANGE, SIZES, SLOT, UNKNOWN, BadMessage, Intake, PublisherGuard, check_slot
+from dtsa_agent.ros.common.checks import RANGE, SIZES, SLOT, UNKNOWN, BadMessage, Intake, check_slot
 from dtsa_agent.ros.common.runs import Call, Run
 
 HEARD = {"sender": [2, 12], "length": [2, 1], "data": [1, 2, 3], "received": [1, 2, 3, 4]}
@@ -69,17 +69,6 @@ def test_odometry(field: str, value: float, expected: str) -> None:
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**50))
 def test_transmissions_start_about_now(start_ns: int, now_ns: int) -> None:
     assert (reason(checks.check_start, start_ns, now_ns) == "") == (-60e9 <= start_ns - now_ns <= 10e9)
-
-
-def test_one_publisher_is_admitted_until_it_is_silent() -> None:
-    known, first = PublisherGuard(b"one"), PublisherGuard()
-    for publisher in (known, first):
-        assert publisher.admits(1.0, b"one")
-        assert not publisher.admits(1.1, b"two")
-        assert publisher.admits(1.2, b"one")
-        assert publisher.admits(1.2, None)  # where the middleware names no senders
-    assert not known.admits(9.0, b"two")
-    assert first.admits(9.0, b"two")  # after a silence: a process started again
 
 
 def test_only_the_channel_can_end_its_run() -> None:

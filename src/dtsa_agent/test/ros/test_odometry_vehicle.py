@@ -6,11 +6,15 @@ import math
 import random
 import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from node_helpers import Graph, end_of, ros_graph
+from node_helpers import Graph, end_of, graph_in, ros_graph
+from rclpy.publisher import Publisher
+from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -19,7 +23,9 @@ from nav_msgs.msg import Odometry
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.plugins import make_swarm
-from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, rotate
+from dtsa_agent.ros.common.checks import OTHER_SENDER, Intake
+from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, VehicleOdometry, VehicleSettings, rotate
+from dtsa_bench.flights.domain import ros_domain
 
 AGENT = "dtsa_agent.ros.agent_node"
 STEP_S = 0.02
@@ -75,6 +81,32 @@ def test_axes_of_the_body_are_turned_into_those_of_the_map() -> None:
 
 
 @pytest.mark.ros
+def test_odometry_of_one_publisher_is_used_until_it_is_silent(tmp_path: Path) -> None:
+    with ros_domain() as domain, ExitStack() as stack:
+        nodes = [stack.enter_context(graph_in(domain, tmp_path)).node for _ in range(3)]
+        intake = Intake()
+        odometry = VehicleOdometry(nodes[0], VehicleSettings(odometry_topic="/odom"), intake)
+        stack.callback(odometry.feed.close)
+        swarm = make_swarm(SwarmConfig(agents=2), None, local=[1])
+        first, second = (node.create_publisher(Odometry, "/odom", 1) for node in nodes[1:])
+        wait_for(lambda: first.get_subscription_count() and second.get_subscription_count())
+
+        def x_after(*publishers: tuple[Publisher, float]) -> float:
+            for publisher, x in publishers:
+                message = Odometry()
+                message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
+                publisher.publish(message)
+            time.sleep(0.02)
+            odometry.sense(swarm)
+            return float(swarm.position[0, 0])
+
+        wait_for(lambda: x_after((first, 1.0)) == 1.0)
+        # Each in its turn, for the feed keeps the last message.
+        wait_for(lambda: x_after((first, 1.0)) == x_after((second, 1.2)) == 1.0 and intake.counts[OTHER_SENDER])
+        wait_for(lambda: x_after((second, 1.2)) == 1.2)
+
+
+@pytest.mark.ros
 def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_path: Path) -> None:
     group = f"239.255.{random.randrange(256)}.{random.randrange(256)}:{random.randrange(20_000, 30_000)}"
     with ros_graph(tmp_path) as graph:
@@ -115,7 +147,7 @@ def test_an_agent_that_never_had_odometry_says_so_and_fails(tmp_path: Path) -> N
 def test_a_vehicle_that_has_to_hover_returns_to_where_that_began(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = OdometryVehicle.__new__(OdometryVehicle)
     vehicle._every, vehicle._hold, sent = 1, None, []
-    monkeypatch.setattr(vehicle, "_fresh", lambda: (0.0, None, None))
+    vehicle._odometry = SimpleNamespace(is_fresh=True)
     monkeypatch.setattr(vehicle, "_command", lambda velocity: sent.append(velocity.tolist()))
     swarm = make_swarm(SwarmConfig(agents=2, policy="lease"), None, local=[1])
 

@@ -85,7 +85,7 @@ class RecordedFlight:
         hearing.subtract_refused(refused)
         result = {
             **self.measurement.summary(),
-            "unusable_messages": channel.intake.total,
+            "unusable_messages": channel.intake.counts.total(),
             "not_taken_in": refused,
             "receptions": {"delivered": hearing.delivered, "taken_in": hearing.accepted},
             "unheard": hearing.problem(refused) or None,

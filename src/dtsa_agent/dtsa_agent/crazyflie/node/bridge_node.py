@@ -141,8 +141,7 @@ def run_bridge(node: BridgeNode, stop: Stop) -> int:
         node.log("error", problem)
         node.bridge.close()
         return 1
-    serving = ExecutorThread(node.context, "executor", node)
-    serving.start()
+    serving = ExecutorThread(node, "executor")
     node.log("info", "ready; Ctrl-C lands all, a second one stops all motors")
     while not stop:
         time.sleep(POLL_S)

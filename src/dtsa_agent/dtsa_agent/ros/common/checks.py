@@ -29,19 +29,17 @@ SIZES = "sizes"  # arrays that do not fit together
 RANGE = "range"  # numbers that cannot be
 SLOT = "slot"  # of a slot that cannot be under way
 FORGED_END = "forged end"
-REASONS = (UNREADABLE, OTHER_RUN, OTHER_SENDER, UNKNOWN, SIZES, RANGE, SLOT, FORGED_END)
 
 LARGEST_SLOT = names.FIRST_CALL - 1  # 248 days of 10 ms slots
 FARTHEST_M = 1e6  # no vehicle is farther from the room's centre, or faster, than this many m or m/s
 FARTHEST_ODOMETRY_M, FASTEST_ODOMETRY_MPS = 1000.0, 100.0  # of vehicles that really fly
-_SILENT_S = 0.3  # after such a silence another publisher may take over
 _LONGEST_TEXT, _LONGEST_NAME, _LONGEST_LINE = 65536, 200, 300  # characters
 _MOST_REASONS = 64
 _LOG_S = 5.0  # from one line in the log to the next
 
 
 class BadMessage(RemoteProtocolError):
-    """A message that is not received, for one of :data:`REASONS`; the text says what is wrong with it."""
+    """A message that is not received, for one of the reasons above; the text says what is wrong with it."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(detail)
@@ -56,18 +54,13 @@ class Intake:
         self._next_line_s = 0.0
         self.counts: Counter[str] = Counter()  # by reason
 
-    @property
-    def total(self) -> int:
-        """Number of all messages dropped."""
-        return self.counts.total()
-
     def drop(self, reason: str, detail: str) -> None:
         """Count a message."""
         self.counts[reason] += 1
         now = time.monotonic()
         if self._logger is not None and now >= self._next_line_s:
             self._next_line_s = now + _LOG_S
-            self._logger.warning(f"not taken in ({reason}): {detail}; {self.total} so far"[:_LONGEST_LINE])
+            self._logger.warning(f"not taken in ({reason}): {detail}; {self.counts.total()} so far"[:_LONGEST_LINE])
 
     @contextmanager
     def guard(self) -> Iterator[None]:
@@ -76,28 +69,6 @@ class Intake:
             yield
         except BadMessage as error:
             self.drop(error.reason, str(error))
-
-
-class PublisherGuard:
-    """Admits the messages of one publisher: of a given sender, or of the first one until it has been silent.
-
-    Where a middleware does not name senders this is off.
-    """
-
-    __slots__ = ("_only", "_sender", "_time_s")
-
-    def __init__(self, sender: bytes | None = None) -> None:
-        self._only = self._sender = sender
-        self._time_s = 0.0
-
-    def admits(self, now_s: float, sender: bytes | None) -> bool:
-        """Return whether a message may be the next one of the publisher (``now_s``: s, monotonic)."""
-        if sender is None:
-            return True
-        if sender != self._sender and (self._only is not None or now_s - self._time_s < _SILENT_S):
-            return False
-        self._sender, self._time_s = sender, now_s
-        return True
 
 
 def check_slot(message: Any, agents: int) -> None:

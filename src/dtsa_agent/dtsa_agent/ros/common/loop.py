@@ -19,7 +19,6 @@ from typing import Any
 
 import rclpy
 from rclpy.callback_groups import CallbackGroup
-from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
@@ -27,12 +26,11 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.stop import Stop
 
 from .checks import UNREADABLE, Intake
 
 _POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
-HOUSEKEEPING_S = 0.1
+_HOUSEKEEPING_S = 0.1
 _SPIN_S = 5.0  # an executor looks for rarer things that often
 _MOST_DROPPED = 16  # messages thrown away in a row before others get their turn
 _SERVING_S, _END_S = 0.5, 2.0
@@ -91,21 +89,21 @@ def _libraries() -> tuple[Any, Any] | None:
 class Feed:
     """A subscription whose messages are read by its owner, at its own time.
 
-    :param intake: counts messages that cannot be read; None: they are errors.
-    :param admits: says by a message and its sender whether it is received; None: all are.
+    :param intake: counts messages that cannot be read or fail the check; None: they are errors.
+    :param check: raises BadMessage if a message of a sender is not to be received; only with an intake.
     :param read: makes messages of serialised bytes, in place of rclpy; ``bytes``: they are given as they are.
     """
 
     def __init__(
         self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, intake: Intake | None = None,
-        admits: Callable[[Any, bytes | None], bool] | None = None, read: Callable[[bytes], Any] | None = None,
+        check: Callable[[Any, bytes | None], None] | None = None, read: Callable[[bytes], Any] | None = None,
     ) -> None:  # fmt: skip
         self.sender: bytes | None = None  # participant of DDS, a process, that sent the last message; None: not known
         self.subscription = node.create_subscription(
             msg_type, topic, self._refuse, qos, callback_group=_NoExecutor(), raw=True
         )
         self.handle = self.subscription.handle
-        self._type, self._intake, self._admits = msg_type, intake, admits
+        self._type, self._intake, self._check = msg_type, intake, check
         self._read = read or partial(deserialize_message, message_type=msg_type)
         self._stack = ExitStack()
         self._stack.enter_context(self.handle)
@@ -151,7 +149,10 @@ class Feed:
                     raise
                 self._intake.drop(UNREADABLE, f"no {self._type.__name__}: {(str(error).splitlines() or [''])[0]}")
                 continue
-            if self._admits is None or self._admits(message, self.sender):
+            if self._check is None or self._intake is None:
+                return message
+            with self._intake.guard():
+                self._check(message, self.sender)
                 return message
         return None
 
@@ -206,11 +207,16 @@ class Loop(Feed):
             return any(wait_set.get_ready_entities(kind) for kind in entities)
 
     def housekeeping(self) -> bool:
-        """Serve parameters and timers if it is time; return whether it was."""
+        """Serve parameters and timers if it is time; return whether it was: about ten times a second.
+
+        ExternalShutdownException: the node's context has been shut down.
+        """
         now = time.monotonic()
         if now < self._next_housekeeping:
             return False
-        self._next_housekeeping = now + HOUSEKEEPING_S
+        if not self._node.context.ok():
+            raise ExternalShutdownException
+        self._next_housekeeping = now + _HOUSEKEEPING_S
         if self._needs_executor():
             if self._executor is None:
                 self._executor = SingleThreadedExecutor(context=self._node.context)
@@ -220,41 +226,25 @@ class Loop(Feed):
                 self._executor.spin_once(timeout_sec=0.0)
         return True
 
-    def run(self, on_message: Callable[[Any], bool], idle: Callable[[], None], stop: Stop) -> None:
-        """Call back until ``on_message`` returns False or a signal comes; ``idle`` about ten times a second."""
-        while not stop:
-            message = self.wait()
-            if message is not None and not on_message(message):
-                return
-            if self.housekeeping():
-                idle()
-            if not self._node.context.ok():
-                raise ExternalShutdownException
-
 
 class ExecutorThread:
-    """Calls the callbacks of nodes in a thread of this name, from ``start`` to ``close``.
+    """Calls the callbacks of a node in a thread of this name until it is closed.
 
     ``Executor.spin`` in a thread raises when the executor is shut down under it; this ends between two callbacks.
     """
 
-    def __init__(self, context: Context, name: str, *nodes: Node) -> None:
-        self.executor = SingleThreadedExecutor(context=context)
-        for node in nodes:
-            self.executor.add_node(node)
-        self._context, self._closed = context, threading.Event()
+    def __init__(self, node: Node, name: str) -> None:
+        self.executor = SingleThreadedExecutor(context=node.context)
+        self.executor.add_node(node)
+        self._context, self._closed = node.context, threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
         """End it: a callback under way is waited for, 2 s at most."""
         self._closed.set()
-        if self._thread.is_alive():
-            self.executor.wake()
-            self._thread.join(_END_S)
+        self.executor.wake()
+        self._thread.join(_END_S)
         self.executor.shutdown(timeout_sec=0)
 
     def _run(self) -> None:

@@ -84,9 +84,8 @@ class GroundStation:
                 *((GoTo, f"/{robot.name}/go_to") for robot in settings.robots),
             )
         }
-        self._serving = ExecutorThread(node.context, "mission", node)
+        self._serving = ExecutorThread(node, "mission")
         self._pulse = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
-        self._serving.start()
         self._pulse.start()
 
     def _receive_status(self, name: str, message: Status) -> None:
