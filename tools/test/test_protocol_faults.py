@@ -144,7 +144,8 @@ def test_the_ledger_sees_broken_rules() -> None:
     assert book.broken == ["slot 3: agent 1 claims others dead in probation, or as it leaves"]
     book = GrantLedger(3, 3)
     book.note_frame(0, 1, encode_extended(ExtendedFrame(dataclasses.replace(own, slot=0), leases=bytes([0, 2]))))
-    [(turn, [(_, lessee)])] = book.issued.items()
+    [(turn, given)] = book.turns.items()
+    [(_, lessee)] = given.given
     own = dataclasses.replace(own, sender=lessee, slot=turn - 2)
     book.note_frame(turn - 2, lessee, encode_extended(ExtendedFrame(own, relay=((2, 1),))))
     assert book.broken == [f"slot {turn - 2}: agent 2 hands turn {turn} on to 1"]

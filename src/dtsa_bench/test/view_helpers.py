@@ -10,13 +10,11 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from bag_helpers import flight_bag
 
-from dtsa_agent.ros.common.cdr import split_frames, unpack_received
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.record import SLOT_RECORD
 from dtsa_bench.pages.view.follower import Follower
@@ -41,36 +39,10 @@ def history_of(bag: Path) -> RunHistory:
         for _, record in opened.typed([SLOT_RECORD]):
             if not len(record.chosen):  # where all are at the end
                 continue
-            follower.receive("Decision", record)
-            follower.receive("MarkerArray", markers_of(record))
-            follower.receive("Slot", delivery_of(record))
-            follower.receive("Reception", record)
+            follower.receive("SlotRecord", record)
     follower.finish("recorded")
     assert not follower.unusable
     return history
-
-
-def markers_of(answer: Any) -> SimpleNamespace:
-    place = answer.track.reshape(answer.steps, 3, -1)[-1].T
-    spheres = [
-        SimpleNamespace(
-            id=int(agent), header=answer.header, pose=SimpleNamespace(position=SimpleNamespace(x=x, y=y, z=z))
-        )
-        for agent, (x, y, z) in zip(answer.agent, place.tolist(), strict=True)
-    ]
-    return SimpleNamespace(markers=spheres)
-
-
-def delivery_of(record: Any) -> SimpleNamespace:
-    """The frames of a slot that at least one agent received, as the channel delivers them."""
-    frames = split_frames(bytes(record.data), record.length.tolist())
-    mask = unpack_received(bytes(record.received), len(frames), len(record.agent)).any(axis=1)
-    kept = np.flatnonzero(mask).tolist()
-    data = np.frombuffer(b"".join(frames[row] for row in kept), np.uint8)
-    lengths = [len(frames[row]) for row in kept]
-    return SimpleNamespace(
-        phase=0, heard_slot=record.slot, sender=record.sender[kept].tolist(), length=lengths, data=data
-    )
 
 
 def numbers(text: str, kind: str) -> np.ndarray:

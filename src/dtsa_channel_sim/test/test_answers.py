@@ -18,7 +18,7 @@ from rclpy.serialization import serialize_message
 
 from dtsa_agent.ros.common.checks import BadMessage
 from dtsa_agent.ros.common.messages import Fields, read_report
-from dtsa_channel_sim.ros.answers import Accounts
+from dtsa_channel_sim.ros.answers import Accounts, places_of
 
 AGENTS, STEPS, LATEST = 5, 1, 50
 IDS, SLOTS = (2, 3), (7, 8)
@@ -39,6 +39,10 @@ def report(**changed: Any) -> Fields:
     return read_report(bytes(serialize_message(Report(**{**fields, **changed}))))
 
 
+def add(made: Accounts, message: Fields) -> int:
+    return made.add(places_of(message.agent, AGENTS), message, LATEST)
+
+
 def accounts() -> Accounts:
     """Accounts in which the frame of agent 1 in slot 6 was delivered to agent 2 alone."""
     made = Accounts(AGENTS, STEPS, keep=100)
@@ -49,13 +53,13 @@ def accounts() -> Accounts:
 
 def test_a_report_fills_accounts_and_only_what_was_delivered_counts_as_taken_in() -> None:
     made = accounts()
-    assert made.add(report(), LATEST) == 8
-    assert made.silent(7) == [1, 4, 5]
+    assert add(made, report()) == 8
+    assert made[7].silent == [1, 4, 5]
     assert made[8].position[:, 1].tolist() == [1.0, 1.0, 1.0]
-    (taken,) = made.receipts(7)
+    (taken,) = made[7].receipts.values()
     assert taken.at_ns.tolist() == [-1, 70_000_000, -1, -1, -1]
     made.close(7)
-    assert made.add(report(), LATEST) == -1  # slot 7 is over, slot 8 is told twice
+    assert add(made, report()) == -1  # slot 7 is over, slot 8 is told twice
     assert made.missed == 2
 
 
@@ -72,10 +76,10 @@ def test_a_report_fills_accounts_and_only_what_was_delivered_counts_as_taken_in(
 def test_what_cannot_be_is_refused_and_changes_nothing(field: str, values: Any, reason: str) -> None:
     made = accounts()
     with pytest.raises(BadMessage) as caught:
-        made.add(report(**{field: values}), LATEST)
+        add(made, report(**{field: values}))
     assert caught.value.reason == reason
-    assert made.silent(7) is None
-    assert made.receipts(7) == []
+    assert not made[7].answered.any()
+    assert not made[7].receipts
 
 
 @given(
@@ -90,7 +94,6 @@ def test_no_report_does_anything_but_fit_or_be_refused(changed: dict[str, list[i
     fields = {name: array(kinds.get(name, "B"), values) for name, values in changed.items()}
     made = accounts()
     with suppress(BadMessage):  # any other error would end the channel
-        made.add(report(**fields), LATEST)
+        add(made, report(**fields))
     for slot in range(LATEST + 1):
-        made.receipts(slot)
         made.close(slot)

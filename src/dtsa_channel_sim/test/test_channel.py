@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_channel_sim import COLLISION, IDLE, SUCCESS, Airtime, Channel, ChannelConfig
+from dtsa_channel_sim import COLLISION, IDLE, SUCCESS, Channel, ChannelConfig
 
 MS = 1_000_000
 
@@ -152,14 +152,6 @@ def check_against_the_definition(rng):
     assert list(verdict.collided or (0,) * len(senders)) == collided
     assert not any(verdict.lost or ())
     assert verdict.outcome == (COLLISION if any(collided) else SUCCESS)
-
-
-def test_airtimes_of_the_radio():
-    airtime = Airtime()
-    assert airtime.on_air_ns(24) == 140_500
-    assert airtime.on_air_ns(60) == 284_500
-    assert airtime.total_ns(60) == 414_500
-    assert Airtime(bitrate=3_000_000_0).on_air_ns(1) == -(-97 * 1000 // 30)
 
 
 def test_a_long_frame_spills_into_short_slots_even_in_lockstep():

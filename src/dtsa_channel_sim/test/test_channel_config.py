@@ -1,16 +1,18 @@
-"""Settings of the channel: validation, YAML, round trips, the schedule."""
+"""Settings of the channel and of clocks: validation, YAML, round trips, the schedule."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_channel_sim import Change, Channel, ChannelConfig, LinkLoss
+from dtsa_channel_sim import Change, Channel, ChannelConfig, ClockConfig, LinkLoss, make_clocks
 from dtsa_channel_sim.model.schedule import Timeline
 from dtsa_channel_sim.model.topology import parse_partition
 
@@ -114,8 +116,7 @@ def test_schedule_against_its_definition(entries):
         expected = schedule[max(live)[1]]["loss"] if live else 0.0
         epoch = timeline.at(slot)
         assert epoch.config.loss == expected
-        assert epoch.first <= slot
-        assert epoch.end is None or slot < epoch.end
+        assert epoch.first <= slot < epoch.end
 
 
 def test_set_takes_effect_from_the_next_slot_and_replays():
@@ -157,3 +158,22 @@ def test_the_example_is_usable():
     assert config.schedule[1].values == (("partition", ((1, 2, 3, 4, 5, 6), (7, 8, 9, 10, 11, 12))),)
     with pytest.raises(ConfigError, match=r"link_loss\[0\]\.to"):
         ChannelConfig.from_yaml(path, agents=6)
+
+
+def test_clocks_depend_on_seed_and_agent_alone():
+    config = ClockConfig(offset_ns=10**9, drift_ppm=50, jitter_ns=1000, seed=3)
+    clocks = make_clocks(config, 200)
+    assert make_clocks(config, 12) == clocks[:12]
+    assert make_clocks(ClockConfig.from_dict(config.to_dict()), 200) == clocks
+    drift = np.array([clock.drift_ppb for clock in clocks])
+    assert np.abs(drift).max() <= 50_000
+    assert abs(drift.mean()) < 4.5 * 50_000 / math.sqrt(3 * 200)
+    assert np.abs(drift).max() > 45_000
+    assert np.abs([clock.offset_ns for clock in clocks]).max() <= 10**9
+
+
+@pytest.mark.parametrize(("name", "value"), [("offset_ns", -1), ("drift_ppm", 2000), ("jitter_ns", "x"), ("skew", 1)])
+def test_bad_clock_settings(name, value):
+    with pytest.raises(ConfigError) as caught:
+        ClockConfig.from_dict({name: value})
+    assert caught.value.field == name

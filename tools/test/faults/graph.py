@@ -25,7 +25,8 @@ _MOST_ENTRIES = 40  # of a random array
 _MESSAGES = "dtsa_msgs.msg"
 _TYPES = {
     **{f"/swarm/{name.lower()}": (_MESSAGES, name) for name in
-       ("Slot", "Transmission", "Frame", "Report", "Process", "Reception", "Decision", "Configuration")},
+       ("Slot", "Transmission", "Frame", "Report", "Process", "Configuration")},
+    "/swarm/slot_record": (_MESSAGES, "SlotRecord"),
     "/swarm/status": (_MESSAGES, "RunStatus"),
     "/cf1/odom": ("nav_msgs.msg", "Odometry"),
     "/clock": ("rosgraph_msgs.msg", "Clock"),
@@ -78,8 +79,8 @@ for _topic in ("transmission", "slot", "frame", "report"):
     _row(f"junk on `/swarm/{_topic}`, real time", _DROPPED, REALTIME, f"/swarm/{_topic}")
 _row("junk on `/swarm/process`, by which nodes show each other what they fly with", _DROPPED, LOCKSTEP,
      "/swarm/process")  # fmt: skip
-_row("junk on `/swarm/reception`, `/swarm/decision`, `/swarm/status`, `/swarm/configuration`", _NOT_BELIEVED,
-     LOCKSTEP, "/swarm/reception /swarm/decision /swarm/status /swarm/configuration", ("random",))  # fmt: skip
+_row("junk on `/swarm/slot_record`, `/swarm/status`, `/swarm/configuration`", _NOT_BELIEVED,
+     LOCKSTEP, "/swarm/slot_record /swarm/status /swarm/configuration", ("random",))  # fmt: skip
 _row("junk on `/cf1/odom` and `/clock`", _NOT_BELIEVED, LOCKSTEP, "/cf1/odom /clock", ("random",))
 _row("all answers and slot messages are published a second time, lockstep",
      "each counts once; the flight goes on; the bag verifies", LOCKSTEP, "/swarm/transmission /swarm/slot",

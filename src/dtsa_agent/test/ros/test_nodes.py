@@ -18,7 +18,7 @@ from process_helpers import segments_of
 pytest.importorskip("dtsa_msgs.msg")
 
 from builtin_interfaces.msg import Time
-from dtsa_msgs.msg import Decision, Frame, Process, Report, Slot, Transmission
+from dtsa_msgs.msg import Frame, Process, Report, Slot, SlotRecord, Transmission
 from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
@@ -238,5 +238,5 @@ def test_frames_survive_the_message(frames: list[bytes]) -> None:
 
 
 def test_reasons_in_the_message_are_those_of_the_core() -> None:
-    named = {name: getattr(Decision, name) for name in dir(Decision) if name.startswith("REASON_")}
+    named = {name: getattr(SlotRecord, name) for name in dir(SlotRecord) if name.startswith("REASON_")}
     assert named == {f"REASON_{name.upper().replace('-', '_')}": code for code, name in enumerate(REASONS)}

@@ -158,7 +158,6 @@ bag take like any other."""
     )
     options = (
         ("bags BAG...", "directory of `agent --out`, or its .mcap file"),
-        ("--air-us X", "a frame is on the air for so long: count overlaps [0]", {"default": "0"}),
         ("--out DIR", "keep the whole flight there: bag, and result as summary.json"),
         ("--json", "print the result as JSON instead of lines"),
     )  # fmt: skip
@@ -167,13 +166,12 @@ bag take like any other."""
         """Merge, and print what came of it."""
         from dtsa_bench.log.agent_bag import read_all
         from dtsa_bench.log.merge.merge import Merge, clocks_apart, is_verified
-        from dtsa_bench.runs.options import check_free, number
+        from dtsa_bench.runs.options import check_free
 
         if args.out:
             check_free(Path(args.out))
-        air_ns = round(number(args.air_us, "air_us", 0, 1e6, "us") * 1e3)
         merged = Merge(*read_all(args.bags))
-        summary = merged.summary(air_ns)
+        summary = merged.summary()
         if args.out:
             from dtsa_bench.log.merged_bag import write_merged
 

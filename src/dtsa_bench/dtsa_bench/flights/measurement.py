@@ -97,8 +97,8 @@ class FlightMeasurement(ChannelObserver):
         """Why the flight is over; empty: it goes on."""
         return str(self.metrics.end or "")
 
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        self._outcome = verdict.outcome
+    def arbitrated(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        self._outcome, frames = verdict.outcome, answers.frames
         self._compared = answers.digest.copy(), answers.chosen.copy()
         self._lengths = [len(frames[sender]) for sender in verdict.senders]
         self.scenario.advance(slot, self.tables)  # what all know about each other's goals
@@ -106,7 +106,7 @@ class FlightMeasurement(ChannelObserver):
         self.hearing.add_slot(len(verdict.senders), mask)
         heard = [(slot, frames[sender], mask[row]) for row, sender in enumerate(verdict.senders) if mask[row].any()]
         if answers.receipts is not None:  # in real time the receivers themselves know best
-            heard = [(taken.slot, taken.data, taken.mask) for taken in answers.receipts]
+            heard = [(taken.slot, taken.data, taken.mask) for taken in answers.receipts.values()]
         for sent_slot, data, receivers in heard:
             if self.tables.hear(sent_slot, data, receivers):
                 self.hearing.add_accepted(receivers)
@@ -152,8 +152,8 @@ class TimingStatistics(ChannelObserver):
         self._away: dict[int, _Sends] = {}  # by agent
         self._delays = Delays(agents)  # by receiver, from a frame's arrival by the channel's time line
 
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        for taken in answers.receipts or ():
+    def arbitrated(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        for taken in (answers.receipts or {}).values():
             receivers = np.flatnonzero(taken.mask)
             self._delays.add_many(taken.at_ns[receivers] - taken.arrival_ns, receivers)
 

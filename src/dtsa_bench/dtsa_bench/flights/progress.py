@@ -6,7 +6,7 @@ import sys
 import time
 from typing import TextIO
 
-from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 from dtsa_channel_sim.ros.ros_channel import RosChannel
 
@@ -66,14 +66,14 @@ class FlightProgress(ChannelObserver):
         self._agents, self._slot_ns = channel.agents, channel.slot_ns
         self._start = time.monotonic()
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         if not self._line.due():
             return
         if self._measurement.begin_s:
             self.show()
         else:
             waited = time.monotonic() - self._start
-            missing = len(status.awaited)
+            missing = len(awaited)
             self._line.show(f"starting, {waited:.0f} s, waiting for {missing} of {self._agents} agents")
 
     def show(self) -> None:

@@ -69,14 +69,14 @@ class RecordedFlight:
         self._timing = TimingStatistics(run.swarm.agents)
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
-            FlightRecorder(directory / BAG, run, self.scenario, self.run_id, self._timing),
+            FlightRecorder(directory / BAG, run, self.scenario, self.channel, self._timing),
             self.measurement,
             LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id, space),
         )
         watch(self.channel, node, run.to_dict(), space)
         if run.mode != LOCKSTEP:
             self.channel.observe(self._timing)
-        follow_parameters(node, model, self.channel.change_settings)
+        follow_parameters(node, self.channel)
 
     def summary(self) -> dict[str, Any]:
         """The flight's results."""

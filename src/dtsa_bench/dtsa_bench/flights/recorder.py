@@ -28,7 +28,8 @@ from dtsa_channel_sim import Change
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 from dtsa_channel_sim.ros.answers import Answers, received_in
 from dtsa_channel_sim.ros.observer import ChannelObserver
-from dtsa_channel_sim.ros.run_topics import RunState, configuration_message
+from dtsa_channel_sim.ros.ros_channel import RosChannel
+from dtsa_channel_sim.ros.run_topics import configuration_message, status_message
 
 from .measurement import TimingStatistics
 from .slot_messages import SlotMessages
@@ -45,9 +46,9 @@ class FlightRecorder(ChannelObserver):
     """
 
     def __init__(
-        self, directory: Path, run: RunConfig, scenario: Scenario, run_id: int, timing: TimingStatistics
+        self, directory: Path, run: RunConfig, scenario: Scenario, channel: RosChannel, timing: TimingStatistics
     ) -> None:
-        self._slot_ns, self._steps, self._run_id = run.swarm.slot_ns, run.swarm.steps, run_id
+        self._slot_ns, self._steps, self._channel, run_id = run.swarm.slot_ns, run.swarm.steps, channel, channel.run_id
         self._packed = SlotMessages(scenario, self._slot_ns, run_id)
         agents = run.swarm.agents
         custom = {"seed": str(run.swarm.seed), RUN_ID: f"{run_id:08x}", FORMAT_KEY: FORMAT}
@@ -67,7 +68,7 @@ class FlightRecorder(ChannelObserver):
         self._pending_slot = -1
         self._complete = -1  # last slot that all have answered,
         self._answered, self._track = np.zeros(agents, np.bool_), np.zeros((self._steps, 3, agents))  # and who, where
-        self._state = RunState(run_id, self._slot_ns)
+        self._reason = ""  # why the run has ended
         data = bytes(serialize_message(configuration_message(run.to_dict(), run_id)))
         self.bag.write(settings, data, names.TIME_ZERO_NS, names.TIME_ZERO_NS)
 
@@ -87,28 +88,26 @@ class FlightRecorder(ChannelObserver):
         self._complete = slot
         self._answered[:], self._track[:] = answers.answered, answers.track
         if not slot:
-            self._write_status(phase=RunStatus.FLYING)
+            self._write_status(RunStatus.FLYING)
 
     def agent_silent(self, agent: int) -> None:
-        self._state.lose(agent)
         if self._accounts is not None:
             self._accounts.lost.add(agent)
         if self._complete >= 0:
-            self._write_status()
+            self._write_status(RunStatus.FLYING)
 
     def agents_back(self, agents: list[int]) -> None:
-        self._state.regain(agents)
         if self._accounts is not None:
             self._accounts.lost -= set(agents)
-        self._write_status()
+        self._write_status(RunStatus.FLYING)
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
-        self._state.reach(self._complete, phase=RunStatus.ENDED, reason=reason)
+        self._reason = reason
 
-    def _write_status(self, **changed: Any) -> None:
-        self._state.reach(self._complete, **changed)
+    def _write_status(self, phase: int, reason: str = "") -> None:
+        message = status_message(self._channel, phase, self._complete, reason=reason)
         at = self._time_ns(max(0, self._complete))
-        self.bag.write(self._status, bytes(serialize_message(self._state.message)), at, at)
+        self.bag.write(self._status, bytes(serialize_message(message)), at, at)
 
     def _write_pending(self) -> None:
         """Write all about the slot before the last one that was answered."""
@@ -127,7 +126,7 @@ class FlightRecorder(ChannelObserver):
 
     def _write_record(self, slot: int, fields: dict[str, Any]) -> None:
         at = self._time_ns(slot)
-        self.bag.write(self._record, pack_record(self._run_id, slot, at, self._steps, **fields), at, at)
+        self.bag.write(self._record, pack_record(self._channel.run_id, slot, at, self._steps, **fields), at, at)
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self._write_pending()
@@ -157,7 +156,7 @@ class FlightRecorder(ChannelObserver):
             self._write_accounts(self._complete - 1, at_end=True)
             here = np.flatnonzero(self._answered)
             self._write_record(self._complete, {"agent": here + 1, "track": self._track[:, :, here]})
-        self._write_status()
+        self._write_status(RunStatus.ENDED, self._reason)
         self.bag.close()
 
 

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.station import check_joinable
 from dtsa_agent.ros.common.names import agent_names
-from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S, RealtimeChannel
 
 from .children import Child, Children, NodeError, describe_end
@@ -26,7 +26,7 @@ class Supervisor(ChannelObserver):
     def __init__(self, children: Children) -> None:
         self._children = children
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         self._children.check()
 
 
@@ -62,7 +62,7 @@ class RealtimeSupervisor(ChannelObserver):
         if text := tight(self._channel):
             self._print(text)
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         begin_s = self._measurement.begin_s
         for child in self._children.ended():
             if not begin_s:

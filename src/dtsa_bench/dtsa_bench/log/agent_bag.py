@@ -10,30 +10,29 @@ import dataclasses
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import monotonic_ns
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.records import Channel, Message, Metadata, Schema
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
 
-from dtsa_agent.air.port import PortProperties, PortSettings, flight_ns
+from dtsa_agent.air.port import PortProperties, PortSettings
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import ns_of, pack_received
+from dtsa_agent.ros.common.cdr import pack_received
 from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS, ReceivedFrames
 from dtsa_bench.log.bag import metadata
-from dtsa_bench.log.bag.errors import BagError, UnusableBag
-from dtsa_bench.log.bag.reader import NOT_OF_ITS_TYPE, checksum_fault, register_type, shared_typestore
-from dtsa_bench.log.bag.recover import RecordScan
+from dtsa_bench.log.bag.errors import BagError, NothingWritten, UnusableBag
+from dtsa_bench.log.bag.reader import Bag, BagMessage
+from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.record import (
@@ -42,6 +41,7 @@ from dtsa_bench.log.record import (
     FORMAT_KEY,
     SLOT_RECORD,
     TYPE,
+    check_format,
     frame_fields,
     make_log,
     pack_record,
@@ -83,11 +83,6 @@ class AgentBag:
         return np.flatnonzero(self.log.known) + self.log.first_slot
 
     @property
-    def start_ns(self) -> NDArray[np.int64]:
-        """(R,) when these started."""
-        return self.log.start_ns[self.log.known[:, 0]]
-
-    @property
     def sent_ns(self) -> NDArray[np.int64]:
         """(F,) when each frame of the log was handed to the network."""
         row = self.log.sent_frames.row
@@ -99,11 +94,6 @@ class AgentBag:
         """What the agent heard."""
         assert self.log.heard is not None
         return self.log.heard
-
-    @property
-    def flight_ns(self) -> int:
-        """From the order to send a frame to its arrival as the agents take it to be, ns."""
-        return flight_ns(self.swarm, self.port)
 
 
 # -- writing ---------------------------------------------------------------------------------------------------------
@@ -232,27 +222,6 @@ def recorded(out: str, agent: LiveAgent, port: PortSettings) -> Iterator[AgentRe
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------
-class NothingWritten(UnusableBag):
-    """A process was started, and ended before it wrote anything."""
-
-
-def find_bag(path: str | Path) -> Path:
-    """The file of what was given as an agent's bag.
-
-    :raises UnusableBag: if there is none, or several.
-    :raises NothingWritten: for a directory without one.
-    """
-    given = Path(path)
-    files = sorted(given.glob("*.mcap")) if given.is_dir() else [given] if given.is_file() else []
-    if len(files) == 1:
-        return files[0]
-    if not given.is_dir():
-        raise UnusableBag(given, "there is no such file or directory")
-    if not files:
-        raise NothingWritten(given, "holds no .mcap file")
-    raise UnusableBag(given, f"holds {len(files)} .mcap files; name one")
-
-
 def find_bags(path: str | Path) -> list[Path]:
     """The agents' bags of a flight in a directory: `cf1.mcap`, ... in it, or each in a directory of its own.
 
@@ -289,110 +258,95 @@ def read(path: str | Path) -> AgentBag:
     :raises UnusableBag: if it is no bag of an agent on a network, or its messages are not those that were recorded.
     :raises NothingWritten: if its process ended before it wrote anything.
     """
-    file = find_bag(path)
+    given = Path(path)
+    if given.is_dir() and not any(given.glob("*.mcap*")):
+        raise NothingWritten(given, "holds no .mcap file")
+    file = metadata.find_files(given)[0]
     try:
         if not file.stat().st_size:
             raise NothingWritten(file, "is empty")
+        with ExitStack() as stack:
+            try:
+                bag, damage = stack.enter_context(Bag(given)), ""
+                messages = list(bag.messages())
+            except UnusableBag:
+                saved = recover(given, Path(stack.enter_context(TemporaryDirectory())) / file.name)
+                bag, damage = stack.enter_context(Bag(saved.directory)), saved.damaged[0] if saved.has_end else ""
+                messages = list(bag.messages())
+            try:
+                bag.check_files()
+            except UnusableBag as error:
+                damage = error.reason
+            return _read_bag(file, bag, messages, damage)
+    except UnusableBag as error:
+        raise type(error)(file, error.reason) from None
     except OSError as error:
         raise UnusableBag(file, error.strerror or str(error)) from None
-    reader = _Reader()
-    with ExitStack() as stack:
-        scan = RecordScan(file, path, stack)
-        for record in scan.records():
-            if scan.faults or not reader.add(record):
-                break
-    if not reader.custom:
-        why = f"not readable ({scan.faults[0]})" if scan.faults else (
-            f"no bag of an agent on a network, as `{program()} agent --out` makes them")  # fmt: skip
-        raise UnusableBag(file, why)
-    is_finished = scan.is_finished and not scan.faults
-    if is_finished and reader.custom.get(KEY, reader.digest.hexdigest()) != reader.digest.hexdigest():
+
+
+def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str) -> AgentBag:
+    """The bag of the agent that a file's metadata describes.
+
+    :param damage: of the file.
+    """
+    custom, digest = bag.custom_data, BagDigest()
+    if AGENT not in custom:
+        raise UnusableBag(file, f"no bag of an agent on a network, as `{program()} agent --out` makes them")
+    if messages:
+        check_format(bag)
+    for message in messages:
+        times = message.log_time_ns, message.publish_time_ns, message.sequence
+        digest.add(message.topic, message.type, *times, message.data)
+    if custom.get(KEY, digest.hexdigest()) != digest.hexdigest():
         raise UnusableBag(file, "a message was changed, left out, added or moved after the recording")
     try:
-        bag = _make_bag(file, reader.custom, reader.records)
-    except (ConfigError, LookupError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        about, summary = json.loads(custom[AGENT]), json.loads(custom.get(SUMMARY, "{}"))
+        swarm = SwarmConfig.from_dict(bag.config["swarm"])
+        agent, started_ns = int(about["id"]), int(about["started_ns"])
+        # As they were recorded: the clock of a vehicle that was switched off starts anew. Up to the first that is lost.
+        own = sorted((one for one in messages if one.topic == SLOT_RECORD), key=lambda message: message.sequence)
+        records = [bag.decode(message) for number, message in enumerate(own) if message.sequence == number]
+        logs = [_log_of(part, file.stem, agent, swarm, about) for part in _split_times(records)]
+        refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})
+        return AgentBag(
+            file, agent, swarm, PortProperties(**about["port"]), started_ns, logs[-1], logs[:-1], refused, summary,
+            BROKEN_OFF in custom, damage, bool(about["goals_told"]),
+        )  # fmt: skip
+    except (DtsaError, LookupError, ValueError, TypeError, AttributeError, OverflowError) as error:
         raise UnusableBag(file, f"what it says of its agent cannot be read ({error})") from None
-    bag.broken_off = bag.broken_off or not is_finished
-    if scan.is_finished or scan.is_closed:
-        bag.damage = scan.faults[0] if scan.faults else checksum_fault(file)
-    return bag
 
 
-class _Reader:
-    """Gathers the slot records of an agent's file, and what it says of its agent."""
-
-    def __init__(self) -> None:
-        self.custom: dict[str, str] = {}  # empty: it is none of an agent, so far
-        self.records: list[Any] = []  # decoded
-        self.digest = BagDigest()
-        self._channel = 0  # of the slot records
-        self._store = get_typestore(Stores.EMPTY)
-
-    def add(self, record: Any) -> bool:
-        """Add a record of the file; return whether it can be used: what follows one that cannot is left out."""
-        try:
-            if isinstance(record, Channel) and record.topic == SLOT_RECORD:
-                self._channel = record.id
-            elif isinstance(record, Schema) and record.name == TYPE:
-                definition = record.data.decode()
-                self._store = shared_typestore(frozenset({(TYPE, definition)}))
-                register_type(self._store, TYPE, definition)
-            elif isinstance(record, Metadata) and record.name == metadata.RECORD_NAME:
-                custom = metadata.custom_data(metadata.load_record(record))
-                self.custom |= custom if AGENT in custom else {}
-            elif isinstance(record, Message) and record.channel_id == self._channel and self.custom:
-                self._add_message(record)
-        except (*NOT_OF_ITS_TYPE, AttributeError):  # the latter of one whose definition has other fields
-            return False
-        return True
-
-    def _add_message(self, record: Message) -> None:
-        times = record.log_time, record.publish_time, record.sequence
-        self.digest.add(SLOT_RECORD.encode(), *times, record.data, True)
-        message: Any = self._store.deserialize_cdr(record.data, TYPE)
-        if len(message.agent) != 1 or len(message.presence) != 1:
-            raise ValueError("not of one agent")
-        by = pack_received(np.ones((len(message.heard_sender), 1), np.bool_))
-        message.agent, message.sender = np.ones_like(message.agent), np.ones_like(message.sender)  # its only column
-        message.heard_by, message.received = np.frombuffer(by, np.uint8), message.received[:0]
-        self.records.append(message)
-
-
-def _make_bag(file: Path, custom: dict[str, str], records: Sequence[Any]) -> AgentBag:
-    """The bag of the agent that a file's metadata describes."""
-    about, summary = json.loads(custom[AGENT]), json.loads(custom.get(SUMMARY, "{}"))
-    swarm = SwarmConfig.from_dict(json.loads(custom["configuration"])["swarm"])
-    agent, started_ns, zero_ns = (int(about[name]) for name in ("id", "started_ns", "zero_ns"))
-    whole_ns = int(custom.get(BROKEN_OFF, 1 << 63))  # `recover` has made this file of one that was not finished
-    times: list[list[Any]] = [[]]  # records, of each time that the agent has taken over
+def _split_times(records: Sequence[Any]) -> list[list[Any]]:
+    """The records of each time that an agent has taken over, the last one perhaps without any."""
+    times: list[list[Any]] = [[]]
     for record in records:
-        if ns_of(record.header.stamp) > whole_ns:
-            continue
         if times[-1] and record.slot <= times[-1][-1].slot:
             if not record.presence[0] & NEW:
                 raise ValueError(f"slot {record.slot} comes after slot {times[-1][-1].slot}")
             times.append([])
         times[-1].append(record)
-    logs = [
-        make_log(part, 1, swarm.slot_ns, False, file.stem, {"swarm": swarm.to_dict(), "mode": REALTIME})
-        for part in times
-    ]
-    for log in logs:
-        assert log.heard is not None
-        assert log.sent_ns is not None
-        if len(log) and log.track.shape[1] != swarm.steps:
-            raise ValueError(f"{log.track.shape[1]} control instants a slot, not {swarm.steps}")
-        log.start_ns += zero_ns
-        log.heard.time_ns[:] += zero_ns
-        times_ns = np.concatenate(
-            (np.array([started_ns], np.int64), log.start_ns, log.sent_ns[:, 0], log.heard.time_ns)
-        )
-        if times_ns.min() < -_MOST_NS or times_ns.max() > _MOST_NS:
-            raise ValueError(f"times beyond {_MOST_NS} ns")
-        if not (1 <= agent <= swarm.agents and np.isin(log.heard.sender, range(1, swarm.agents + 1)).all()):
-            raise ValueError(f"ids of agents that are not among {swarm.agents}")
-    refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})
-    return AgentBag(
-        file, agent, swarm, PortProperties(**about["port"]), started_ns, logs[-1], logs[:-1], refused, summary,
-        broken_off=BROKEN_OFF in custom, goals_told=bool(about["goals_told"]),
-    )  # fmt: skip
+    return times
+
+
+def _log_of(records: Sequence[Any], name: str, agent: int, swarm: SwarmConfig, about: Mapping[str, Any]) -> FlightLog:
+    """The log of an agent's records, with its own column alone, as that of agent 1, and times of its own clock."""
+    for record in records:
+        if len(record.agent) != 1 or len(record.presence) != 1:
+            raise ValueError("not of one agent")
+        record.agent, record.sender = np.ones_like(record.agent), np.ones_like(record.sender)
+        by = pack_received(np.ones((len(record.heard_sender), 1), np.bool_))
+        record.heard_by, record.received = np.frombuffer(by, np.uint8), record.received[:0]
+    log = make_log(records, 1, swarm.slot_ns, False, name, {"swarm": swarm.to_dict(), "mode": REALTIME})
+    assert log.heard is not None
+    assert log.sent_ns is not None
+    if len(log) and log.track.shape[1] != swarm.steps:
+        raise ValueError(f"{log.track.shape[1]} control instants a slot, not {swarm.steps}")
+    log.start_ns += int(about["zero_ns"])
+    log.heard.time_ns[:] += int(about["zero_ns"])
+    started_ns = np.array([int(about["started_ns"])], np.int64)
+    times_ns = np.concatenate((started_ns, log.start_ns, log.sent_ns[:, 0], log.heard.time_ns))
+    if times_ns.min() < -_MOST_NS or times_ns.max() > _MOST_NS:
+        raise ValueError(f"times beyond {_MOST_NS} ns")
+    if not (1 <= agent <= swarm.agents and np.isin(log.heard.sender, range(1, swarm.agents + 1)).all()):
+        raise ValueError(f"ids of agents that are not among {swarm.agents}")
+    return log

@@ -140,11 +140,6 @@ class FlightArrays:
         return self.length > 0
 
     @property
-    def slot(self) -> NDArray[np.int64]:
-        """(S,) numbers of the slots."""
-        return np.arange(len(self))
-
-    @property
     def position(self) -> Floats:
         """(S, K, 3, N) m: true positions at the control instants of each slot, the last at its end."""
         return self.track[1:]
@@ -182,19 +177,14 @@ class FlightArrays:
         lost, collided = (values[row, column].astype(np.int64) for values in (self.lost, self.collided))
         return SentFrames(row, column + 1, data, self.received, lost, collided)
 
-    @cached_property
-    def _frame_ends(self) -> NDArray[np.int64]:
-        return np.cumsum(self.length, dtype=np.int64)
-
     def frame(self, row: int, sender: int) -> bytes:
         """The frame that an agent sent in a slot; empty: none."""
-        place = row * self.agents + sender - 1
-        end = int(self._frame_ends[place])
-        return self.data[end - int(self.length[row, sender - 1]) : end]
+        return self.frames_in(row).get(sender, b"")
 
     def frames_in(self, row: int) -> dict[int, bytes]:
         """The frames that were sent in a slot, by the sender's id."""
-        return {column + 1: self.frame(row, column + 1) for column in np.flatnonzero(self.length[row]).tolist()}
+        frames, part = self.sent_frames, slice(*self.sent_ends[row : row + 2])
+        return dict(zip(frames.sender[part].tolist(), frames.data[part], strict=True))
 
     @cached_property
     def sent_ends(self) -> list[int]:
@@ -249,11 +239,6 @@ class FlightArrays:
     def path_velocity(self) -> Floats:
         """(T, 3, N) m/s: true velocities at the instants of `path`."""
         return self._instants[2]
-
-    @property
-    def start(self) -> Floats:
-        """(3, N) m, frame map: where the agents were at the start of slot 0."""
-        return np.asarray(self.track[0, -1])
 
     def check_kept(self) -> None:
         if not self.is_kept:

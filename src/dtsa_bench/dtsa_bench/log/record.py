@@ -10,24 +10,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import SECOND, ns_of, pack_received, split_frames, unpack_received
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
-from dtsa_bench.log.bag.reader import Bag, register_type
+from dtsa_bench.log.bag.reader import Bag
 
 from .arrays import DECIDED, PRESENT, UNKNOWN, VECTORS, ReceivedFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
 
-SLOT_RECORD, TYPE = f"{names.SWARM}/slot_record", "dtsa_msgs/msg/SlotRecord"
+SLOT_RECORD, TYPE = f"{names.SWARM}/{names.SLOT_RECORD}", "dtsa_msgs/msg/SlotRecord"
 CONFIGURATION = "dtsa_msgs/msg/Configuration"
 _HEADER = "std_msgs/msg/Header"
 FORMAT, FORMAT_KEY = "2", "format"  # of bags, and its name in custom data
 AGENT, SNIFFER = "agent", "sniffer"  # custom data: what the record of one agent, or of a listener, says of itself
-_OF_FORMAT_1 = {f"{names.SWARM}/{topic}" for topic in (names.RECEPTION, names.TRANSMISSION, names.DECISION)}
+_OF_FORMAT_1 = {f"{names.SWARM}/{topic}" for topic in ("reception", "transmission", "decision")}
 _KINDS = {
     "agent": "u2", "presence": "u1", "chosen": "u2", "reason": "u1", "digest": "u4", "score": "f8", "offset_ns": "i8",
     "track": "f8", "velocity": "f8", "command": "f8", "goal": "f8", "sender": "u2", "length": "u1", "data": "u1",
@@ -38,23 +37,21 @@ _NOTHING = {name: np.zeros(0, kind) for name, kind in _KINDS.items()}
 
 
 @cache
-def _store() -> Any:
-    store = get_typestore(Stores.EMPTY)
-    for kind in (TYPE, CONFIGURATION):
-        register_type(store, kind, schema.installed(kind).text)
-    return store
+def _store(kind: str) -> Any:
+    return schema.typestore_of(schema.installed(kind))
 
 
 def _header(time_ns: int) -> Any:
-    stamp = _store().types["builtin_interfaces/msg/Time"](*divmod(time_ns, SECOND))
-    return _store().types[_HEADER](stamp, names.FRAME)
+    types = _store(TYPE).types
+    return types[_HEADER](types["builtin_interfaces/msg/Time"](*divmod(time_ns, SECOND)), names.FRAME)
 
 
 def pack_configuration(run: int, settings: Mapping[str, Any]) -> bytes:
     """A dtsa_msgs/Configuration as CDR."""
     text = json.dumps(settings, sort_keys=True)
-    message = _store().types[CONFIGURATION](_header(names.TIME_ZERO_NS), run, str(settings["mode"]), text)
-    return bytes(_store().serialize_cdr(message, CONFIGURATION))
+    store = _store(CONFIGURATION)
+    message = store.types[CONFIGURATION](_header(names.TIME_ZERO_NS), run, str(settings["mode"]), text)
+    return bytes(store.serialize_cdr(message, CONFIGURATION))
 
 
 def pack_record(run: int, slot: int, time_ns: int, steps: int, outcome: int = UNKNOWN, **fields: Any) -> bytes:
@@ -65,7 +62,8 @@ def pack_record(run: int, slot: int, time_ns: int, steps: int, outcome: int = UN
     """
     arrays = {name: np.ascontiguousarray(values, _KINDS[name]).ravel() for name, values in fields.items()}
     head = {"header": _header(time_ns), "run": run, "slot": slot, "outcome": outcome, "steps": steps}
-    return bytes(_store().serialize_cdr(_store().types[TYPE](**head, **_NOTHING | arrays), TYPE))
+    store = _store(TYPE)
+    return bytes(store.serialize_cdr(store.types[TYPE](**head, **_NOTHING | arrays), TYPE))
 
 
 def frame_fields(frames: Mapping[int, bytes], received: NDArray[np.bool_] | None) -> dict[str, Any]:
@@ -102,9 +100,9 @@ def check_format(bag: Bag) -> None:
     :raises UnusableBag: if it does not.
     """
     if topic := bag.topics.get(SLOT_RECORD):
-        bag.register(topic)
+        recorded = bag.typestore(SLOT_RECORD).fielddefs
         for kind, found in ((TYPE, topic.type), (_HEADER, _HEADER)):
-            (_, ours), (_, theirs) = _store().fielddefs[kind], bag.typestore.fielddefs.get(found, ((), ()))
+            (_, ours), (_, theirs) = _store(TYPE).fielddefs[kind], recorded.get(found, ((), ()))
             if not dict(ours).items() <= dict(theirs).items():
                 raise UnusableBag(bag.given, f"{SLOT_RECORD} is {topic.type}, without fields of this version's {kind}")
         return
@@ -167,9 +165,10 @@ def _name(bag: Bag) -> str:
     return directory.parent.name if directory.name == "bag" else directory.name
 
 
-# Fields by agent or sender, whatever their other axes; those that may be empty.
+# Fields by agent or sender, whatever their other axes; values of those that a record may leave out.
 _BY_AGENT = (*DECIDED, *VECTORS, "track", "offset_ns", "presence")
-_BY_SENDER, _MAY_BE_EMPTY = ("length", "lost", "collided", "sent_ns"), {"offset_ns", "presence", "sent_ns"}
+_BY_SENDER = ("length", "lost", "collided", "sent_ns")
+_LEFT_OUT = {"offset_ns": 0, "sent_ns": 0, "presence": PRESENT, "heard_before": 0}
 
 
 def make_log(
@@ -179,85 +178,93 @@ def make_log(
 
     :raises ValueError: if they do not fit together.
     """
-    slots = [int(record.slot) for record in records]
-    first, last = 0 if is_whole else min(slots, default=0), max(slots, default=-1)
-    if last - first > 2 * len(slots) + 1000 or len(set(slots)) < len(slots):
+    records = sorted(records, key=lambda record: int(record.slot))
+    slots = np.array([record.slot for record in records], np.int64)
+    first, last = (0 if is_whole or not records else int(slots[0])), int(slots.max(initial=-1))
+    if last - first > 2 * len(slots) + 1000 or (np.diff(slots) == 0).any():
         raise ValueError("most slots are missing, or a number is damaged")
-    # The last one of a flight says where all are at the end, and may say no more.
-    has_end = is_whole and bool(slots)
+    own_clocks = settings.get("mode") == names.MODES[1] or any(
+        len(values) for record in records for values in (record.sent_ns, record.offset_ns, record.heard_sender)
+    )
+    has_presence, has_end = any(len(record.presence) for record in records), is_whole and bool(records)
     steps = max((int(record.steps) for record in records), default=1)
     arrays = empty_arrays(last - first + (not has_end), agents, steps, slot_ns)
-    frames: dict[tuple[int, int], tuple[bytes, NDArray[np.uint8]]] = {}  # by row and sender: bytes, receivers
-    nothing = np.zeros(0, np.int64)
-    heard, heard_data = [(nothing, nothing, nothing, nothing, np.zeros((0, agents), np.uint8), nothing)], list[bytes]()
-    for record, slot in zip(records, slots, strict=True):
-        row, at, columns = slot - first, _columns(record.agent, agents), _columns(record.sender, agents)
-        if has_end and slot == last:
-            _fill(arrays, record, ("track",), row, at)
-            continue
-        arrays["recorded"][row], arrays["known"][row, at], arrays["presence"][row, at] = True, True, PRESENT
-        arrays["outcome"][row] = min(int(record.outcome), UNKNOWN)
-        arrays["start_ns"][row] = ns_of(record.header.stamp) - names.TIME_ZERO_NS
-        _fill(arrays, record, _BY_AGENT, row, at)
-        if len(columns):
-            _fill(arrays, record, _BY_SENDER, row, columns)
-            data = split_frames(record.data, record.length.tolist())
-            masks = np.zeros((len(columns), agents), np.uint8)
-            if len(record.received):  # else it is not known
-                masks = unpack_received(record.received.tobytes(), len(columns), agents)
-            for column, sent, mask in zip(columns.tolist(), data, masks, strict=True):
-                if not sent:
-                    raise ValueError(f"slot {slot}: an empty frame of cf{column + 1}")
-                frames[row, column + 1] = sent, mask
-        if count := len(record.heard_sender):
-            before = record.heard_before if len(record.heard_before) else np.zeros(count, np.uint8)
-            times_ns = record.heard_ns + arrays["start_ns"][row]
-            by = unpack_received(record.heard_by.tobytes(), count, agents)
-            heard.append((np.full(count, row), record.heard_sender, record.heard_slot, times_ns, by, before))
-            lengths = record.heard_length.tolist() or [0] * count
-            heard_data += split_frames(record.heard_data, lengths)
-            if {len(values) for values in (*heard[-1], lengths)} != {count}:
-                raise ValueError(f"slot {slot}: frames that were heard")
-    keys = sorted(frames)
-    received = np.array([frames[key][1] for key in keys], np.bool_).reshape(len(keys), agents)
-    own_clocks = (
-        settings.get("mode") == names.MODES[1]
-        or len(heard) > 1
-        or any(len(record.sent_ns) or len(record.offset_ns) for record in records)
-    )
+    if has_end:  # the last one of a flight says where all are at the end, and may say no more
+        _fill(arrays, [records.pop()], first, "agent", ("track",))
+    rows = slots[: len(records)] - first
+    arrays["recorded"][rows] = True
+    arrays["outcome"][rows] = [min(int(record.outcome), UNKNOWN) for record in records]
+    arrays["start_ns"][rows] = [ns_of(record.header.stamp) - names.TIME_ZERO_NS for record in records]
+    arrays["known"][_fill(arrays, records, first, "agent", _BY_AGENT)] = True
+    row, column = _fill(arrays, records, first, "sender", _BY_SENDER)
+    data: list[bytes] = []
+    received = np.zeros((len(row), agents), np.bool_)
+    for record in records:
+        at = len(data)
+        data += split_frames(record.data, record.length.tolist())
+        if len(record.received):  # else it is not known
+            received[at : len(data)] = unpack_received(record.received.tobytes(), len(data) - at, agents)
+    if not all(data):
+        raise ValueError("an empty frame")
+    frames = dict(zip(zip((row + first).tolist(), (column + 1).tolist(), strict=True), data, strict=True))
+    heard = _heard_by(records, rows, arrays["start_ns"][rows], agents, frames) if own_clocks else None
     presence, sent_ns = arrays.pop("presence"), arrays.pop("sent_ns")
     return FlightLog(
-        name=name, settings=settings, agents=agents, slot_ns=slot_ns,
-        data=b"".join([frames[key][0] for key in keys]), received=received, first_slot=first, has_end=has_end,
-        presence=presence if any(len(record.presence) for record in records) else None,
-        sent_ns=sent_ns if own_clocks else None,
-        heard=_received_frames(heard, heard_data, frames, first) if own_clocks else None, **arrays,
+        name=name, settings=settings, agents=agents, slot_ns=slot_ns, data=b"".join(data), received=received,
+        first_slot=first, has_end=has_end, presence=presence if has_presence else None,
+        sent_ns=sent_ns if own_clocks else None, heard=heard, **arrays,
     )  # fmt: skip
 
 
-def _columns(ids: NDArray[np.uint16], agents: int) -> NDArray[np.intp]:
-    """The columns of ascending ids."""
-    index = np.asarray(ids, np.intp) - 1
-    if len(index) and (index[0] < 0 or index[-1] >= agents or (np.diff(index) <= 0).any()):
-        raise ValueError(f"ids {ids.tolist()}")
-    return index
+def _fill(
+    arrays: dict[str, Any], records: Sequence[Any], first: int, by: str, fields: Sequence[str]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Copy fields of records, with an entry for each agent that the field `by` names.
 
-
-def _fill(arrays: dict[str, Any], record: Any, fields: Sequence[str], row: int, columns: NDArray[np.intp]) -> None:
-    """Copy fields of a record into the row of a slot."""
+    :param first: slot of the first row.
+    :returns: rows and columns of the entries.
+    """
+    counts = np.array([len(getattr(record, by)) for record in records], np.int64)
+    row = np.repeat(np.array([record.slot for record in records], np.int64) - first, counts)
+    column = _column(records, by, counts).astype(np.int64) - 1
+    agents = arrays["known"].shape[1]
+    if len(column) and (column.min() < 0 or column.max() >= agents or (np.diff(row * agents + column) <= 0).any()):
+        raise ValueError(f"ids that do not ascend from 1 to {agents}")
     for name in fields:
-        values, target = getattr(record, name), arrays[name][row]
-        if len(values) or name not in _MAY_BE_EMPTY:
-            at = slice(None) if len(columns) == target.shape[-1] else columns  # of all agents, which is faster
-            target[..., at] = values.reshape(*target.shape[:-1], len(columns))
+        arrays[name][row, ..., column] = _column(records, name, counts, arrays[name].shape[1:-1])
+    return row, column
 
 
-def _received_frames(
-    heard: Sequence[Any], data: Sequence[bytes], frames: Mapping[tuple[int, int], Any], first: int
-) -> ReceivedFrames:
-    """The frames that agents took in; those without bytes of their own are as they were sent."""
-    row, sender, slot, time_ns, by, before = (np.concatenate(column) for column in zip(*heard, strict=True))
-    keys = zip((slot.astype(np.int64) - first).tolist(), sender.tolist(), strict=True)
-    whole = [own or frames.get(key, (b"",))[0] for own, key in zip(data, keys, strict=True)]
-    numbers = (values.astype(np.int64) for values in (row, sender, slot, time_ns))
-    return ReceivedFrames(*numbers, by.astype(np.bool_), before.astype(np.bool_), whole)
+def _column(records: Sequence[Any], field: str, counts: NDArray[np.int64], shape: tuple[int, ...] = ()) -> NDArray[Any]:
+    """The entries of a field, of some shape, of which records have so many."""
+    parts = [np.zeros((*shape, 0), _KINDS[field])]
+    for record, count in zip(records, counts.tolist(), strict=True):
+        values = getattr(record, field)
+        if not len(values) and field in _LEFT_OUT:
+            values = np.full(count, _LEFT_OUT[field], _KINDS[field])
+        parts.append(values.reshape(*shape, count))
+    return np.moveaxis(np.concatenate(parts, axis=-1), -1, 0)
+
+
+def _heard_by(
+    records: Sequence[Any], rows: NDArray[np.int64], start_ns: NDArray[np.int64], agents: int,
+    frames: Mapping[tuple[int, int], bytes],
+) -> ReceivedFrames:  # fmt: skip
+    """The frames that agents took in; those without bytes of their own are as they were sent: `frames`."""
+    counts = np.array([len(record.heard_sender) for record in records], np.int64)
+    sender, slot, late_ns, before = (
+        _column(records, f"heard_{name}", counts) for name in ("sender", "slot", "ns", "before")
+    )
+    by, own = [np.zeros((0, agents), np.uint8)], list[bytes]()
+    for record, count in zip(records, counts.tolist(), strict=True):
+        by.append(unpack_received(record.heard_by.tobytes(), count, agents))
+        lengths = record.heard_length.tolist() or [0] * count
+        if len(lengths) != count:
+            raise ValueError(f"slot {record.slot}: frames that were heard")
+        own += split_frames(record.heard_data, lengths)
+    keys = zip(slot.tolist(), sender.tolist(), strict=True)
+    return ReceivedFrames(
+        np.repeat(rows, counts), sender.astype(np.int64), slot.astype(np.int64), np.repeat(start_ns, counts) + late_ns,
+        np.concatenate(by).astype(np.bool_), before.astype(np.bool_),
+        [data or frames.get(key, b"") for data, key in zip(own, keys, strict=True)],
+    )  # fmt: skip

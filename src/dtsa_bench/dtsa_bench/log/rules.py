@@ -27,9 +27,10 @@ PLAIN = "plain"
 
 
 @dataclass(slots=True)
-class HandedTurn:
-    """Agents that a turn was given to."""
+class GrantedTurn:
+    """A turn that was given away, and the agents that it was given to."""
 
+    given: list[tuple[int, int]] = field(default_factory=list)  # issuer, lessee
     holders: set[int] = field(default_factory=set)  # named last, one for each that gave it away
     named: set[int] = field(default_factory=set)  # ever
     handed_on: dict[int, int] = field(default_factory=dict)  # slot in which an agent first handed it on
@@ -50,8 +51,7 @@ class GrantLedger:
     agents: int
     anchor_every: int
     main_every: int = 0
-    issued: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # turn -> (issuer, lessee)
-    handed: dict[int, HandedTurn] = field(default_factory=dict)  # by turn
+    turns: dict[int, GrantedTurn] = field(default_factory=dict)
     quiet: dict[int, int] = field(default_factory=dict)  # last slot in which each was in probation
     collisions: Counter[str] = field(default_factory=Counter)  # slots with two senders, by a key of COLLISIONS or PLAIN
     leased_slots: int = 0
@@ -84,22 +84,22 @@ class GrantLedger:
 
     def check_slot(self, slot: int, frames: dict[int, bytes]) -> None:
         """Takes in one slot."""
-        given, handed = self.issued.pop(slot, []), self.handed.pop(slot, HandedTurn())
-        owner = slot % self.agents + 1
-        is_open = any(lessee == OPEN for _, lessee in given)
-        adopted = any(issuer != owner for issuer, _ in given)
-        self.leased_slots += bool(given) and not is_open and not adopted
+        turn, owner = self.turns.pop(slot, GrantedTurn()), slot % self.agents + 1
+        is_open = any(lessee == OPEN for _, lessee in turn.given)
+        adopted = any(issuer != owner for issuer, _ in turn.given)
+        self.leased_slots += bool(turn.given) and not is_open and not adopted
         if len(frames) > 1:
             cause = (
                 "open" if is_open else "adopted" if adopted
                 else "anchor" if self._is_reclaimed(slot, frames.get(owner))
-                else "handed" if any(self._has_forgotten(handed, sender) for sender in frames) else PLAIN
+                else "handed" if any(self._has_forgotten(turn, sender) for sender in frames) else PLAIN
             )  # fmt: skip
             self.collisions[cause] += 1
             if cause == PLAIN:
-                self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}, by now to {handed.holders}")
+                to = f"given {turn.given}, by now to {turn.holders}"
+                self.broken.append(f"slot {slot}: senders {sorted(frames)}, {to}")
         for sender, data in frames.items():
-            self._check_sender(slot, sender, owner, given, data, handed)
+            self._check_sender(slot, sender, data, turn)
             self.note_frame(slot, sender, data)
 
     def _is_reclaimed(self, slot: int, data: bytes | None) -> bool:
@@ -108,19 +108,17 @@ class GrantLedger:
             return False
         return decode_extended(data).probation
 
-    def _has_forgotten(self, handed: HandedTurn, sender: int) -> bool:
+    def _has_forgotten(self, turn: GrantedTurn, sender: int) -> bool:
         """Whether a sender handed the turn on before it restarted: what others relay may be all that it knows."""
-        return self.quiet.get(sender, -1) > handed.handed_on.get(sender, self._NEVER)
+        return self.quiet.get(sender, -1) > turn.handed_on.get(sender, self._NEVER)
 
-    def _check_sender(
-        self, slot: int, sender: int, owner: int, given: list[tuple[int, int]], data: bytes, handed: HandedTurn
-    ) -> None:
-        last = handed.holders
-        if sender in last or OPEN in last or self._has_forgotten(handed, sender):
+    def _check_sender(self, slot: int, sender: int, data: bytes, turn: GrantedTurn) -> None:
+        last, owner = turn.holders, slot % self.agents + 1
+        if sender in last or OPEN in last or self._has_forgotten(turn, sender):
             return
         if sender != owner:
             self.broken.append(f"slot {slot}: agent {sender} sends in a turn of {owner} given to {sorted(last)}")
-        elif any(issuer == owner for issuer, _ in given) and not self._is_reclaimed(slot, data):
+        elif any(issuer == owner for issuer, _ in turn.given) and not self._is_reclaimed(slot, data):
             self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(last)}")
 
     def note_frame(self, slot: int, sender: int, data: bytes) -> None:
@@ -137,19 +135,19 @@ class GrantLedger:
         leases = frame.leases
         if leases and slot % self.agents != sender - 1:
             self.broken.append(f"slot {slot}: agent {sender} gives turns away in another agent's turn")
-        for turn, lessee in zip(self._turns_of_leases(slot, frame.c_s, len(leases)), leases, strict=False):
+        for number, lessee in zip(self._turns_of_leases(slot, frame.c_s, len(leases)), leases, strict=False):
             if not lessee:
                 continue
-            owner = turn % self.agents + 1
-            if self._is_main(turn) or turn <= slot:
-                self.broken.append(f"slot {slot}: agent {sender} gives away turn {turn}")
-            entries, handed = self.issued.setdefault(turn, []), self.handed.setdefault(turn, HandedTurn())
-            if lessee in handed.named and any(issuer == sender for issuer, _ in entries):
-                continue  # said again
-            if sender == owner and any(issuer == owner for issuer, _ in entries):
-                self.broken.append(f"slot {slot}: agent {sender} gives turn {turn} away a second time")
-            entries.append((sender, lessee))
-            handed.name(lessee)
+            if self._is_main(number) or number <= slot:
+                self.broken.append(f"slot {slot}: agent {sender} gives away turn {number}")
+            turn = self.turns.setdefault(number, GrantedTurn())
+            is_again = any(issuer == sender for issuer, _ in turn.given)
+            if is_again and lessee in turn.named:
+                continue
+            if is_again and sender == number % self.agents + 1:
+                self.broken.append(f"slot {slot}: agent {sender} gives turn {number} away a second time")
+            turn.given.append((sender, lessee))
+            turn.name(lessee)
         for ahead, lessee in (*frame.relay, *((far, frame.far_lessee) for far in frame.far)):
             self._hand_on(slot, sender, slot + ahead, lessee)
 
@@ -159,17 +157,16 @@ class GrantLedger:
         An agent that does not know yet that it was named relays an earlier holder. That one takes the turn again, so it
         counts as handing on.
         """
-        handed = self.handed.get(turn)
-        if handed is None or sender not in handed.holders or lessee in handed.holders:
+        given = self.turns.get(turn)
+        if given is None or sender not in given.holders or lessee in given.holders:
             return
         if lessee in (OPEN, turn % self.agents + 1) or self._is_main(turn):
-            if lessee in handed.named:  # a relay of another one that gave it away
-                return
-            self.broken.append(f"slot {slot}: agent {sender} hands turn {turn} on to {lessee}")
+            if lessee not in given.named:  # else a relay of another one that gave it away
+                self.broken.append(f"slot {slot}: agent {sender} hands turn {turn} on to {lessee}")
             return
-        handed.holders.remove(sender)
-        handed.name(lessee)
-        handed.handed_on.setdefault(sender, slot)
+        given.holders.remove(sender)
+        given.name(lessee)
+        given.handed_on.setdefault(sender, slot)
 
 
 class RuleChecker:

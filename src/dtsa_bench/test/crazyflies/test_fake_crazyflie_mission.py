@@ -49,7 +49,6 @@ from dtsa_bench.pages.report.data import run_data
 from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_channel_sim import ChannelConfig
-from dtsa_channel_sim.ros.observer import ChannelStatus
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 COUNT = 4
@@ -121,11 +120,11 @@ def test_two_as_near_as_in_a_crash_or_somebody_who_may_still_fly_fail_a_mission(
     run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
     metrics, ended = FlightMetrics(run, make_scenario(swarm)), StopToken(Stop())
     mission: Any = SimpleNamespace(ended=ended, check_bridge_process=lambda: None)
-    watch, status = MissionWatch(mission, MagicMock(), metrics), ChannelStatus(0, [])
-    watch.idle(status)
+    watch = MissionWatch(mission, MagicMock(), metrics)
+    watch.idle(0, [])
     assert not ended.reason
     metrics.update(0, np.array([[[0.0, 0.19, 2.0], [0.0] * 3, [0.0] * 3]]), None, 0)
-    watch.idle(status)
+    watch.idle(0, [])
     assert ended.reason == "cf1 and cf2 came within 0.19 m of each other (collision_m is 0.2)"
 
 

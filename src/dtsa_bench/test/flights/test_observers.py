@@ -34,7 +34,7 @@ from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
-from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus, ObserverError, Observers
+from dtsa_channel_sim.ros.observer import ChannelObserver, ObserverError, Observers
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 Sender = TypeVar("Sender", bound="LateSender")
@@ -47,8 +47,8 @@ class Diary(ChannelObserver):
     def all_answered(self, slot: int, answers: Answers) -> None:
         self.pages.append(f"{self.name}answered {slot}")
 
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        assert sorted(frames) == list(verdict.senders)
+    def arbitrated(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        assert sorted(answers.frames) == list(verdict.senders)
         self.pages.append(f"{self.name}judged {slot}")
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
@@ -156,7 +156,7 @@ class LateSender(ChannelObserver):
     def start_known(self, at_s: float) -> None:
         self._begin_s = at_s
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         run_id, slot_ns = self._channel.run_id, self._channel.slot_ns
         slot = max(0, round((time.monotonic() - self._begin_s) * 1e9) // slot_ns + 5) if self._begin_s else 0
         settings = {"agents": 2, "slot_ms": slot_ns / 1e6, "steps": 1, "mode": "realtime"}
@@ -180,7 +180,7 @@ class LateSender(ChannelObserver):
             )
         )  # fmt: skip
 
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+    def arbitrated(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         for row, sender in enumerate(verdict.senders):
             self.frames.append((sender, verdict.received[row].tolist(), verdict.collided[row]))
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_bench.flights.measurement import TimingStatistics
+from dtsa_bench.log.arrays import SentFrames
 from dtsa_bench.log.verify.on_air import FramesOnAir
 from dtsa_bench.log.verify.result import Mismatch
 from dtsa_channel_sim import Air, Channel, ChannelConfig
@@ -23,8 +24,9 @@ FRAMES = st.lists(FRAME, min_size=2, max_size=12, unique_by=lambda frame: frame[
 def sent_frames(config: ChannelConfig, frames: list[tuple[Any, ...]]) -> FramesOnAir:
     """Frames of slot 0 and on: sender, start in ns, bytes, whom it reached, how many lost it, and where it collided."""
     sender, asked_ns, length, received, lost, collided = (list(column) for column in zip(*frames, strict=True))
-    numbers = (np.array(column) for column in (range(len(frames)), sender, length))
-    return FramesOnAir(config, *numbers, np.array(received, np.bool_), *map(np.array, (lost, collided, asked_ns)))
+    masks, data = np.array(received, np.bool_), [bytes(size) for size in length]
+    sent = SentFrames(np.arange(len(frames)), np.array(sender), data, masks, np.array(lost), np.array(collided))
+    return FramesOnAir(config, sent, np.array(asked_ns))
 
 
 def resolved(config: ChannelConfig, frames: list[tuple[int, int, int]]) -> tuple[list[Any], FramesOnAir]:

@@ -58,7 +58,7 @@ def check(run: SyntheticRun, path: Path, target: Path) -> None:
         with Bag(bag) as opened:
             assert opened.config == RunConfig(run.config).to_dict()
             assert {name: topic.count for name, topic in opened.topics.items()} == run.writer.counts
-            assert (opened.message_count, opened.start_ns) == (sum(run.writer.counts.values()), SECOND)
+            assert opened.start_ns == SECOND
         assert len(load_log(bag).outcome) == 39  # the last one is not answered
 
 
@@ -202,7 +202,7 @@ def test_bags_that_are_compressed_by_file_or_message(run: SyntheticRun, tmp_path
         for key, value in source.custom_data.items():
             writer.set_custom_data(key, value)
         connections = {
-            name: writer.add_connection(name, t.type, msgdef=t.definition, rihs01=t.type_hash)
+            name: writer.add_connection(name, t.type, msgdef=t.definition.text, rihs01=t.definition.type_hash)
             for name, t in source.topics.items()
         }
         for message in source.messages():

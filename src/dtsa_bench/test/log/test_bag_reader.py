@@ -20,8 +20,6 @@ from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.record import SLOT_RECORD
 from dtsa_bench.runs.config import RunConfig
 
-RECEPTION = "dtsa_msgs/msg/Reception"
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
@@ -56,7 +54,7 @@ def test_messages_are_exactly_those_recorded_in_order_of_time_and_can_be_chosen(
 @given(st.lists(st.integers(0, 40), max_size=120), st.integers(1, 30))
 def test_order_holds_whatever_the_order_of_writing(tmp_path_factory, times, per_chunk):
     directory = tmp_path_factory.mktemp("order") / "bag"
-    kind = RECEPTION
+    kind = "dtsa_msgs/msg/Transmission"
     with BagWriter(directory, {}) as writer:
         channels = [writer.add_topic(name, kind, "reliable", definition(kind)) for name in ("/a", "/b")]
         for number, time in enumerate(times):

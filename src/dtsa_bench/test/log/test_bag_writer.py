@@ -137,8 +137,6 @@ def test_directories_in_use_closed_bags_and_wrong_messages_are_refused(tmp_path:
     for path in (tmp_path, tmp_path / "something"):
         with pytest.raises(ConfigError, match="empty or does not exist"):
             BagWriter(path, {})
-    with pytest.raises(ConfigError, match="zstd, lz4, none"):
-        BagWriter(tmp_path / "bag", {}, compression="rar")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
     run = synthetic_bag(tmp_path / "closed", slots=1)
     run.writer.close()
@@ -148,11 +146,9 @@ def test_directories_in_use_closed_bags_and_wrong_messages_are_refused(tmp_path:
     with BagWriter(tmp_path / "bag", {}) as writer:
         kind = "nav_msgs/msg/Odometry"
         channel = writer.add_topic("/odom", kind, "reliable", definition(kind))
-        with pytest.raises(BagError, match="times of a bag start at"):
-            writer.write(channel, b"\0\1\0\0", SECOND - 1, SECOND)
         with pytest.raises(BagError, match="never added"):
             writer.write(channel + 1, b"\0\1\0\0", SECOND, SECOND)
         with pytest.raises(ConfigError, match="not in the bag yet"):
             writer.add_topic("/odom", kind, "reliable", definition(kind))
     with Bag(tmp_path / "bag") as bag:
-        assert bag.message_count == 0
+        assert bag.topics["/odom"].count == 0

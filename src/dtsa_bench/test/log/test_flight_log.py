@@ -66,8 +66,8 @@ def test_a_log_is_pickled_and_written_as_parquet(bag: Path, tmp_path: Path) -> N
 
 def test_bags_of_format_1_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with BagWriter(tmp_path / "old", {"swarm": {"agents": 3}}) as writer:
-        for topic, kind in (("/swarm/reception", "Reception"), ("/swarm/transmission", "Transmission")):
-            writer.add_topic(topic, f"dtsa_msgs/msg/{kind}", "reliable", definition(f"dtsa_msgs/msg/{kind}"))
+        for topic in ("/swarm/reception", "/swarm/transmission"):
+            writer.add_topic(topic, kind := "dtsa_msgs/msg/Transmission", "reliable", definition(kind))
     with pytest.raises(UnusableBag, match="bag format 1, and this version reads format 2"):
         load_log(tmp_path / "old")
     with pytest.raises(UnusableBag, match="bag format 1"):
@@ -87,7 +87,7 @@ def rewritten(bag: Path, target: Path, change: Callable[[Any], dict[str, Any]]) 
             for name, value in change(record).items():
                 old = getattr(record, name)
                 setattr(record, name, np.ascontiguousarray(value, old.dtype) if isinstance(old, np.ndarray) else value)
-            data = bytes(source.typestore.serialize_cdr(record, TYPE))
+            data = bytes(source.typestore(SLOT_RECORD).serialize_cdr(record, TYPE))
             copy.write(channel, data, message.log_time_ns, message.publish_time_ns)
     return target
 

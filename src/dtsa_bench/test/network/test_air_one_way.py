@@ -15,9 +15,9 @@ from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings, UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
-from dtsa_bench.log.agent_bag import AgentBag, AgentRecorder, NothingWritten, read
+from dtsa_bench.log.agent_bag import AgentBag, AgentRecorder, read
 from dtsa_bench.log.arrays import split_log
-from dtsa_bench.log.bag.errors import UnusableBag
+from dtsa_bench.log.bag.errors import NothingWritten, UnusableBag
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merge.timeline import Crossings, both_ways, fit
 from dtsa_bench.log.merged_flight import MergedReplay, slots_until_all_known
@@ -84,22 +84,25 @@ def test_two_agents_of_which_one_is_deaf_have_no_time_line(bags, tmp_path, capsy
 
 
 def test_an_agent_that_wrote_nothing_is_named_and_the_others_are_merged(bags, tmp_path, capsys):
-    empty, killed = tmp_path / "cf3", tmp_path / "killed"
-    empty.mkdir()
-    killed.mkdir()
+    empty, killed, begun = (tmp_path / name for name in ("cf3", "killed", "begun"))
+    for directory in (empty, killed, begun):
+        directory.mkdir()
     (killed / "cf3.mcap").touch()
+    with AgentRecorder(tmp_path / "begun.mcap", AgentSettings(id=3), CONFIG, UdpSettings(interface="lo")):
+        (begun / "cf3.mcap").write_bytes((tmp_path / "begun.mcap").read_bytes())  # killed before its first slot
     whole = tmp_path / "whole"
-    code, found, said = _merged(capsys, bags[0], empty, bags[1], killed, "--out", whole)
+    code, found, said = _merged(capsys, bags[0], empty, bags[1], killed, begun, "--out", whole)
     assert code == 0, said
-    assert found["nothing_written"] == [str(empty), str(killed)]
+    assert found["nothing_written"] == [str(empty), str(killed), str(begun)]
     assert (found["bags"], found["missing"], found["not_determined"]) == (2, [3], [])
-    assert [str(empty) in line or str(killed) in line for line in said.splitlines()] == [True, True]
+    lines = zip(said.splitlines(), found["nothing_written"], strict=True)
+    assert all(path in line for line, path in lines)
     assert found["flight"]["pairs_known_share"] is not None
     assert verify_bag(whole).ok
     assert any(str(empty) in note for note in run_data(whole)["notes"])
     with pytest.raises(NothingWritten, match=r"holds no \.mcap file"):
         read(empty)
-    for words in ([empty], [empty, killed], [bags[0], tmp_path / "never"]):
+    for words in ([empty], [begun], [empty, killed], [bags[0], tmp_path / "never"]):
         code, _, said = _merged(capsys, *words)
         assert (code, said.count("\n")) == (2, 1)
 

@@ -190,7 +190,7 @@ def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespa
                     raw = bytearray(getattr(record, name).tobytes())
                     raw[8 if name == "data" else 0] ^= 1
                     setattr(record, name, np.frombuffer(bytes(raw), getattr(record, name).dtype))
-                    data, changed = bytes(bag.typestore.serialize_cdr(record, message.type)), True
+                    data, changed = bytes(bag.typestore(SLOT_RECORD).serialize_cdr(record, message.type)), True
                 elif message.topic == "/cf2/odom" and name == "odom" and not changed:
                     data, changed = data[:60] + bytes([data[60] ^ 1]) + data[61:], True
                 copy.write(channels[message.topic], data, message.log_time_ns, message.publish_time_ns)
@@ -221,6 +221,12 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Pa
     again = Merge([saved, *(read(path) for path in flight.bags[1:])]).summary()
     assert {**again, "broken_off": []} == {**found, "broken_off": []}, again
     assert again["broken_off"] == ["cf1"]
+    middle = len(whole) // 2
+    cut.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    bag = read(cut)
+    assert bag.damage
+    assert 0 < len(bag.log) <= len(read(flight.bags[0]).log)
+    assert not verify_bag(cut).ok
     for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
         cut.write_bytes(bad)
         with pytest.raises(DtsaError):

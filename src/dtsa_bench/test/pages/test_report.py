@@ -202,15 +202,13 @@ def test_data_in_the_page_is_the_data(data: dict[str, Any]) -> None:
 
 
 def test_a_bag_without_a_usable_configuration_still_gives_a_page(tmp_path: Path, flights: dict[str, Path]) -> None:
-    from dtsa_bench.log.bag.schema import Definition
 
     with (
         Bag(flights["clean"]) as bag,
         BagWriter(tmp_path / "strange", {"swarm": {"agents": 6, "policy": "of tomorrow"}}) as writer,
     ):
         channels = {
-            name: writer.add_topic(name, t.type, list(t.profiles), Definition(t.type, t.definition, t.type_hash))
-            for name, t in bag.topics.items()
+            name: writer.add_topic(name, t.type, list(t.profiles), t.definition) for name, t in bag.topics.items()
         }
         for message in bag.messages():
             writer.write(channels[message.topic], message.data, message.log_time_ns, message.publish_time_ns)

@@ -117,7 +117,9 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
         browser.wait_for("dtsa.live.view.run.events.some(event => event.text.includes('loss is 0.25'))")
         wait_for(lambda: slots_of(listener) > 50)
         stack.close()
-        assert listener.since(0, MAX_MOMENTS)[1][-1].heard
+        moments = listener.since(0, MAX_MOMENTS)[1]
+        assert moments[-1].heard
+        assert json.loads(moments[-1].text)["lag_ms"] > 0.0
 
 
 @pytest.mark.ros

@@ -10,33 +10,21 @@ from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from dtsa_agent.core.errors import LocalProtocolError
 
 from .airtime import Airtime
-from .config import ChannelConfig
-from .medium import Mask, Medium, OnAir, Positions
+from .channel import Channel
+from .medium import Mask, OnAir, Positions
 
 Key = TypeVar("Key", bound=Hashable)
 
 NEVER = 2**63  # ns
 _GRACE = 0.05  # of a slot: frames are handed over ahead of their start; one that is late by less still collides
 _WINDOW = 0.5  # of a slot: a frame that reaches a live channel later than this after its start is dropped
-
-
-class Media(Protocol):
-    """The medium by slot: settings may change in flight. A :class:`~dtsa_channel_sim.model.channel.Channel` is one."""
-
-    config: ChannelConfig
-
-    def medium(self, slot: int) -> Medium:
-        """Return the medium of a slot."""
-
-    def advance(self, slot: int) -> None:
-        """Note that a slot has been dealt with: later changes of settings begin after it."""
 
 
 class Arrivals:
@@ -144,7 +132,7 @@ class Air(Generic[Key]):
     Times are ns from the start of slot 0 by the channel's clock; positions are (3, N), m, frame map, and needed with a
     limited range or capture.
 
-    :param channel: the medium.
+    :param channel: the medium by slot.
     :param airtime: how long transmissions take; None: as the radio's frames.
     """
 
@@ -153,7 +141,7 @@ class Air(Generic[Key]):
         "_near", "_resolved", "_resolved_ns", "late",
     )  # fmt: skip
 
-    def __init__(self, channel: Media, airtime: Airtime | None = None) -> None:
+    def __init__(self, channel: Channel, airtime: Airtime | None = None) -> None:
         self._channel = channel
         self._airtime = airtime = airtime or channel.config.airtime
         self._longest_ns = airtime.total_ns(airtime.longest)
@@ -295,7 +283,7 @@ class LiveAir(Air[tuple[int, int]]):
     A frame is named by its slot, as its sender counts, and the sender's id.
     """
 
-    def __init__(self, channel: Media) -> None:
+    def __init__(self, channel: Channel) -> None:
         super().__init__(channel)
         config = channel.config
         # A delivery may come no earlier than the frame arrives.

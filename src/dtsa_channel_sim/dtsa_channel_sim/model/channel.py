@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 
 from .config import ChannelConfig
-from .losses import NoiseSource
 from .medium import Medium, OnAir
 from .schedule import Change, Timeline
 from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 Positions = NDArray[np.float64]
-_FOREVER = 2**63
 
 
 class Channel:
@@ -34,13 +32,12 @@ class Channel:
 
     __slots__ = (
         "_airtime", "_alone", "_end", "_first", "_idle", "_last", "_losses", "_medium", "_near", "_shared", "_simple",
-        "_source", "_spills", "_timeline", "config",
+        "_spills", "_timeline", "config",
     )  # fmt: skip
 
     def __init__(self, config: ChannelConfig) -> None:
         self.config = config
         self._timeline = Timeline(config)
-        self._source = NoiseSource(config.seed, config.agents)
         self._airtime = config.airtime
         self._near: list[OnAir] = []  # of the slots before, what outlasts them
         self._last = -1
@@ -127,9 +124,8 @@ class Channel:
         """Make the settings of a slot the present ones."""
         if slot < 0:
             raise LocalProtocolError(f"slot {slot}: slots count from 0")
-        self._first, end, config = self._timeline.at(slot)
-        self._end = _FOREVER if end is None else end
-        self._medium = Medium(config, self._source)
+        self._first, self._end, config = self._timeline.at(slot)
+        self._medium = Medium(config)
         self._losses = self._medium.losses
         # Frames that start with their slot and do not outlast it, everybody in reach: no look at times and
         # places.

@@ -13,7 +13,7 @@ Words are even, so a threshold of 2^64 - 1 means "always" and 0 means "never", e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,12 +61,8 @@ class WordBlocks:
     def __init__(self, seed: int, stream: int, agents: int) -> None:
         self._seed, self._stream, self.agents = seed, stream, agents
         self.rows = max(16, _BLOCK_WORDS // agents)
-
-    @cached_property
-    def factors(self) -> list[np.uint64]:
-        """An odd 64-bit constant per sender, by id: the words of its links are those of the receivers times it; 0: 1"""
-        bits = generator(self._seed, self._stream, _FACTORS).bit_generator.random_raw(self.agents + 1)
-        return [np.uint64(1), *(np.uint64(int(word) | 1) for word in bits[1:])]
+        #: An odd 64-bit constant per sender, by id: the words of its links are those of the receivers times it; 0: 1.
+        self.factors = _factors(seed, stream, agents)
 
     def row(self, slot: int) -> Words:
         """Return the words of one slot, (N,)."""
@@ -91,3 +87,9 @@ def _block(seed: int, stream: int, number: int, rows: int, agents: int) -> Words
     block = (raw & np.uint64(2**64 - 2)).reshape(rows, agents)
     block.setflags(write=False)
     return block
+
+
+@lru_cache(maxsize=32)
+def _factors(seed: int, stream: int, agents: int) -> list[np.uint64]:
+    bits = generator(seed, stream, _FACTORS).bit_generator.random_raw(agents + 1)
+    return [np.uint64(1), *(np.uint64(int(word) | 1) for word in bits[1:])]

@@ -19,13 +19,6 @@ from .topology import link_matrix
 Mask = NDArray[np.bool_]
 
 
-class NoiseSource:
-    """The random numbers of a channel: the same for all settings that it goes through."""
-
-    def __init__(self, seed: int, agents: int) -> None:
-        self.words, self.state_words = WordBlocks(seed, LOSS, agents), WordBlocks(seed, STATE, agents)
-
-
 class Losses:
     """Losses under one set of settings.
 
@@ -33,10 +26,10 @@ class Losses:
     P(received) = (1 - loss) (1 - link loss) (1 - measured loss).
     """
 
-    __slots__ = ("_bad", "_certain", "_chains", "_good", "_lent", "_per_link", "_source", "none")
+    __slots__ = ("_bad", "_certain", "_chains", "_good", "_lent", "_per_link", "_states", "_words", "none")
 
-    def __init__(self, config: ChannelConfig, source: NoiseSource) -> None:
-        self._source = source
+    def __init__(self, config: ChannelConfig) -> None:
+        self._words, self._states = (WordBlocks(config.seed, stream, config.agents) for stream in (LOSS, STATE))
         links = link_matrix(config.loss_matrix, config.link_loss, config.agents)
         measured = config.losses if isinstance(config.losses, MeasuredLosses) else None
         #: True when no frame is ever lost to noise.
@@ -49,7 +42,7 @@ class Losses:
         elif config.burst_length and config.loss:
             model = GilbertElliott.from_means(config.loss, config.burst_length, config.p_good, config.p_bad)
             good, bad = [config.p_good, links], [config.p_bad, links]
-        self._chains = None if model is None else Chains(model, source.state_words)
+        self._chains = None if model is None else Chains(model, self._states)
         # Words below these are losses, by sender.
         self._good, self._bad = (thresholds(_combined(causes), config.agents) for causes in (good, bad))
         # The plain Gilbert channel needs no second draw: bad loses all, good loses none.
@@ -63,8 +56,7 @@ class Losses:
             if self._certain:
                 return is_bad
             limits = np.where(is_bad, self._bad[sender - 1], limits)
-        words = self._source.words
-        lost: Mask = words.row(slot) * words.factors[sender] < limits
+        lost: Mask = self._words.row(slot) * self._words.factors[sender] < limits
         return lost
 
     def fill(self, slot: int, losses: Any) -> int:
@@ -72,7 +64,7 @@ class Losses:
         losses.none, losses.chains = self.none, 0
         if self.none:
             return 2**63 - 1
-        words, states = self._source.words, self._source.state_words
+        words, states = self._words, self._states
         number = slot // words.rows
         losses.first = number * words.rows
         arrays = {

@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import LocalProtocolError
 
 from .airtime import Airtime
 from .config import ChannelConfig
-from .losses import Losses, NoiseSource
+from .losses import Losses
 
 Mask = NDArray[np.bool_]
 Positions = NDArray[np.float64]
@@ -66,7 +66,7 @@ class Medium:
         "needs_positions",
     )  # fmt: skip
 
-    def __init__(self, config: ChannelConfig, source: NoiseSource | None = None) -> None:
+    def __init__(self, config: ChannelConfig) -> None:
         self._agents = config.agents
         self._range2 = config.range_m**2
         self._disturb2 = (config.range_m * config.interference_factor) ** 2
@@ -77,7 +77,7 @@ class Medium:
         for number, group in enumerate(config.groups):
             self._groups[np.asarray(group) - 1] = number
         #: Which receivers lose a frame to noise.
-        self.losses = Losses(config, source or NoiseSource(config.seed, config.agents))
+        self.losses = Losses(config)
         self.needs_positions = config.needs_positions
         #: True when everybody hears and disturbs everybody: two frames at one time destroy each other
         #: everywhere.

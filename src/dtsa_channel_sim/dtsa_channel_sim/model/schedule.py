@@ -15,6 +15,7 @@ from .topology import parse_links, parse_partition
 
 _SLOT = Setting("slot", "int", None, "a slot", minimum=0, maximum=2**53)
 _SECONDS = Setting("at_s", "float", None, "seconds after the start of slot 0", unit="s", minimum=0, maximum=1e9)
+_FOREVER = 2**63  # slots
 _TIMES = ("slot", "at_s", "until", "until_s")
 
 Config: TypeAlias = Any  # a :class:`.config.ChannelConfig`, which a schedule may change
@@ -84,10 +85,10 @@ def _read_slot(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: 
 
 
 class Epoch(NamedTuple):
-    """Slots with the same settings: from ``first`` up to, not including, ``end``; None: it lasts."""
+    """Slots with the same settings: from ``first`` up to, not including, ``end``."""
 
     first: int
-    end: int | None
+    end: int
     config: Config
 
 
@@ -126,7 +127,7 @@ class Timeline:
         """Return the slots with the same settings to which a slot belongs."""
         at = bisect_right(self._changes, slot, key=_slot_of)
         first = self._changes[at - 1].slot if at else 0
-        return Epoch(first, self._changes[at].slot if at < len(self._changes) else None, self._configs[at])
+        return Epoch(first, self._changes[at].slot if at < len(self._changes) else _FOREVER, self._configs[at])
 
 
 _slot_of = attrgetter("slot")

@@ -20,7 +20,7 @@ class Verdict(NamedTuple):
     jammer is a SUCCESS with ``lost`` counting all of them.
     """
 
-    outcome: int  # IDLE, SUCCESS or COLLISION, the numbers of dtsa_msgs/Reception
+    outcome: int  # IDLE, SUCCESS or COLLISION, the numbers of dtsa_msgs/SlotRecord
     senders: tuple[int, ...]  # ids of all agents that sent, in the order given
     received: NDArray[np.bool_] | None  # (F, N) frame f reached agent column + 1; None: all but the sender have all
     lost: tuple[int, ...] | None  # per frame: receivers in reach that lost it to noise or jamming; None: none

@@ -22,7 +22,6 @@ from dtsa_agent.core.swarm import Swarm
 from dtsa_channel_sim.model.air import NEVER, Air, Arrivals
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import ChannelConfig
-from dtsa_channel_sim.model.losses import NoiseSource
 from dtsa_channel_sim.model.medium import Mask, Medium, Positions
 
 SLOTTED = ("tdma", "age", "error", "lease")
@@ -247,6 +246,5 @@ class Transport:
         """Return the medium as messages of a topic find it: noise is drawn for each topic."""
         if topic not in self._media:
             digest = hashlib.sha256(f"{self.config.seed} {topic}".encode()).digest()
-            source = NoiseSource(int.from_bytes(digest[:8], "little") >> 1, self.config.agents)
-            self._media[topic] = Medium(self.config, source)
+            self._media[topic] = Medium(replace(self.config, seed=int.from_bytes(digest[:8], "little") >> 1))
         return self._media[topic]

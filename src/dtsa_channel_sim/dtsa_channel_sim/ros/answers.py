@@ -62,9 +62,9 @@ class Answers:
         self.command = self._motion[-6:-3]  # m/s, now
         self.goal = self._motion[-3:]  # m
         self.offset_ns = np.zeros(agents, dtype=np.int64)  # real time: of slot or transmission
-        self.receipts: list[FrameReceipt] | None = None  # real time: what agents report to have received
+        #: In real time: what agents report to have received, by slot and sender; None: in lockstep.
+        self.receipts: dict[tuple[int, int], FrameReceipt] | None = None
         self._goal_known = np.zeros(agents, dtype=np.bool_)
-        self._places: dict[bytes, Places] = {}
         self._lengths: dict[int, tuple[int, ...]] = {}  # of the fields of answers that fit, by number of agents
 
     @property
@@ -83,14 +83,15 @@ class Answers:
         self.missing = self.agents
         self.frames = {}
 
-    def add(self, message: Fields) -> bool:
+    def add(self, at: Places, message: Fields) -> bool:
         """Add one transmission message; return False if its agents have answered already: nothing is changed then.
 
+        :param at: places of its agents.
         :raises BadMessage: if its fields do not fit together, naming the agents as far as it does.
         """
-        at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
         if self.answered[at].any():
             return False
+        count = len(message.agent)
         lengths = (message.steps, *map(len, _SEQUENCES(message)))
         if lengths != self._lengths.get(count) or len(message.goal) not in (0, 24 * count):
             sizes = {"length": count, **sizes_of(count, self.steps)}
@@ -125,7 +126,7 @@ class Answers:
         return True
 
     def add_report(self, at: Places, message: Fields, row: int) -> None:
-        """Add what some agents report for one slot, a row of a report; checked before."""
+        """Add what some agents report for one slot, a row of a report that was checked."""
         count, rows = len(message.agent), len(message.slot)
         motion = [getattr(message, name).reshape(rows, -1)[row] for name in _MOTION]
         self._motion[:, at] = np.concatenate(motion).reshape(-1, count)
@@ -145,19 +146,14 @@ class Answers:
         self.goal[:, unknown] = before.goal[:, unknown]
 
 
-def places_of(ids: Any, agents: int, known: dict[bytes, Places]) -> Places:
-    """Return the indices of a message's agents, a slice where they are consecutive; ``known`` keeps them.
+def places_of(ids: Any, agents: int) -> Places:
+    """Return the indices of some agents, a slice where they are consecutive.
 
     :raises BadMessage: for ids that do not ascend from 1 to N.
     """
-    key = ids.tobytes()
-    places = known.get(key)
-    if places is None:
-        check_ids(ids, agents)
-        index = np.array(ids, dtype=np.intp) - 1
-        consecutive = index[-1] - index[0] + 1 == len(index)
-        places = known[key] = slice(int(index[0]), int(index[-1]) + 1) if consecutive else index
-    return places
+    check_ids(ids, agents)
+    index = np.array(ids, dtype=np.intp) - 1
+    return slice(int(index[0]), int(index[-1]) + 1) if index[-1] - index[0] + 1 == len(index) else index
 
 
 def sizes_of(count: int, steps: int) -> dict[str, int]:
@@ -191,20 +187,14 @@ class Accounts:
         self._open: dict[int, Answers] = {}
         self._closed = -1
         self._delivered: dict[tuple[int, int], tuple[bytes, int, NDArray[np.bool_]]] = {}  # by slot and sender
-        self._receipts: dict[int, dict[tuple[int, int], FrameReceipt]] = {}  # by slot here; slot and sender
-        self._places: dict[bytes, Places] = {}
 
     def __getitem__(self, slot: int) -> Answers:
         """The account of a slot that is not closed."""
         book = self._open.get(slot)
         if book is None:
             book = self._open[slot] = Answers(self.agents, self._steps)
+            book.receipts = {}
         return book
-
-    def silent(self, slot: int) -> list[int] | None:
-        """Return the ids of the agents that have not reported for a slot; None: there is no report."""
-        book = self._open.get(slot)
-        return None if book is None else book.silent
 
     def last_place(self, agent: int) -> Array | None:
         """Return the last position that an agent has reported, (3,) m; None: in no slot yet."""
@@ -215,13 +205,13 @@ class Accounts:
         """A frame has been sent to its receivers, (N,)."""
         self._delivered[slot, sender] = data, arrival_ns, received
 
-    def add(self, message: Fields, latest: int) -> int:
+    def add(self, at: Places, message: Fields, latest: int) -> int:
         """Add a report; return its last slot that is still open, -1: none. No slot after ``latest`` can have begun.
 
+        :param at: places of its agents.
         :raises BadMessage: if its fields do not fit together.
         """
-        at, count = places_of(message.agent, self.agents, self._places), len(message.agent)
-        _check_report(message, self._steps)
+        check_report(message, self._steps)
         slots = message.slot.tolist()
         last = max(slots[-1] if slots else 0, max(message.heard_in.tolist(), default=0))
         if last > latest:
@@ -229,7 +219,7 @@ class Accounts:
         newest = -1
         for row, slot in enumerate(slots):
             if slot <= self._closed:
-                self.missed += count
+                self.missed += len(message.agent)
                 continue
             book = self[slot]
             if not book.answered[at].any():  # else reported twice
@@ -239,7 +229,8 @@ class Accounts:
             if (slot, sender) not in self._delivered:  # it was not sent to any receiver
                 continue
             data, arrival_ns, received = self._delivered[slot, sender]
-            receipts = self._receipts.setdefault(max(here, self._closed + 1), {})
+            receipts = self[max(here, self._closed + 1)].receipts
+            assert receipts is not None
             if (slot, sender) not in receipts:
                 never = np.full(self.agents, -1, dtype=np.int64)
                 receipts[slot, sender] = FrameReceipt(slot, sender, data, arrival_ns, never)
@@ -251,13 +242,8 @@ class Accounts:
         """A slot is over: its account and what is too old is forgotten."""
         self._closed = slot
         self._open.pop(slot, None)
-        self._receipts.pop(slot, None)
         while self._delivered and (oldest := next(iter(self._delivered)))[0] < slot - self._keep:
             del self._delivered[oldest]
-
-    def receipts(self, slot: int) -> list[FrameReceipt]:
-        """Return the frames that agents received during a slot, as far as they have reported."""
-        return list(self._receipts.get(slot, {}).values())
 
 
 def received_in(message: Fields) -> Iterator[tuple[int, int, int, int, NDArray[np.bool_]]]:
@@ -269,8 +255,11 @@ def received_in(message: Fields) -> Iterator[tuple[int, int, int, int, NDArray[n
     return zip(*(column.tolist() for column in columns), masks, strict=True)
 
 
-def _check_report(message: Fields, steps: int) -> None:
-    """Check that the fields of a report fit together."""
+def check_report(message: Fields, steps: int) -> None:
+    """Check that the fields of a report fit together.
+
+    :raises BadMessage: if they do not.
+    """
     count, slots, heard = len(message.agent), len(message.slot), len(message.heard_sender)
     sizes = {"offset_ns": count * slots, "length": count * slots, **sizes_of(count * slots, steps)}
     sizes |= dict.fromkeys(("heard_slot", "heard_in", "heard_ns"), heard) | {"heard_by": heard * -(-count // 8)}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,6 @@ from dtsa_agent.ros.common.parameters import check_parameters, declare_settings,
 from dtsa_agent.stop import Stop
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, AnswerLimits, ChannelConfig
-from dtsa_channel_sim.model.schedule import Change
 
 from .lockstep import LockstepChannel
 from .realtime_channel import RealtimeChannel
@@ -45,19 +44,17 @@ def declare_channel(node: Node, config: ChannelConfig | None = None) -> dict[str
     return declare_settings(node, ChannelConfig, changeable=True, defaults=defaults)
 
 
-def follow_parameters(node: Node, channel: Channel, changed: Callable[[Change], None] | None = None) -> None:
-    """Let ``ros2 param set`` change the channel in flight, from the next slot on; ``changed`` is told each change."""
+def follow_parameters(node: Node, channel: RosChannel) -> None:
+    """Let ``ros2 param set`` change the channel in flight, from the next slot on."""
     known = {setting.name: setting for setting in settings_of(ChannelConfig) if setting.name in CHANGEABLE}
 
     def apply(parameters: list[Parameter]) -> SetParametersResult:
         values = {p.name: from_parameter(known[p.name], p.value) for p in parameters if p.name in known}
         if values:
             try:
-                change = channel.set(**values)
+                channel.change_settings(**values)
             except ConfigError as error:
                 return SetParametersResult(successful=False, reason=str(error))
-            if changed:
-                changed(change)
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(apply)
@@ -78,7 +75,7 @@ def watch(channel: RosChannel, node: Node, settings: Mapping[str, Any], space: s
     """Tell the graph how a run is doing: topics in the swarm's namespace, diagnostics, transforms, the log."""
     channel.observe(
         RunLog(node, channel.run_id, isinstance(channel, LockstepChannel)),
-        RunTopics(node, settings, channel.run_id, channel.slot_ns, space),
+        RunTopics(node, settings, channel, space),
         Diagnostics(node, channel),
     )
     try:
@@ -102,7 +99,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         )
         try:
             watch(channel, node, {"mode": run.mode, "channel": config.to_dict()}, space)
-            follow_parameters(node, medium, channel.change_settings)
+            follow_parameters(node, channel)
             if run.mode != MODES[0]:
                 set_realtime(first)
             channel.run(stop)

@@ -46,10 +46,9 @@ class LockstepChannel(RosChannel):
         if not self._call(stop):
             return
         verdict: Verdict | None = None
-        frames: dict[int, bytes] = {}
         slot = 0
         while not stop:
-            self._open(slot, frames, verdict)
+            self._open(slot, verdict)
             if slot and verdict is not None:
                 self._observers.slot_over(slot - 1, self.answers, verdict)
             self.answers.open()
@@ -59,10 +58,10 @@ class LockstepChannel(RosChannel):
             senders = sorted(frames)
             lengths = [len(frames[sender]) for sender in senders]
             verdict = self.model.arbitrate(slot, senders, lengths, self.answers.position)
-            self._observers.arbitrated(slot, self.answers, frames, verdict)
+            self._observers.arbitrated(slot, self.answers, verdict)
             slot += 1
 
-    def _open(self, slot: int, frames: dict[int, bytes], verdict: Verdict | None) -> None:
+    def _open(self, slot: int, verdict: Verdict | None) -> None:
         """Publish the message that opens a slot."""
         time_ns = names.slot_time_ns(slot, self.slot_ns)
         heard_slot = max(slot - 1, 0)
@@ -70,7 +69,7 @@ class LockstepChannel(RosChannel):
             mask = verdict.mask(self.agents)
             heard = np.flatnonzero(mask.any(axis=1))
             senders = [verdict.senders[row] for row in heard]
-            received = [frames[sender] for sender in senders]
+            received = [self.answers.frames[sender] for sender in senders]
             self._bytes = self._pack_slot(time_ns, slot, heard_slot, senders, received, mask[heard])
         else:
             self._bytes = self._pack_slot(time_ns, slot, heard_slot)
@@ -111,16 +110,17 @@ class LockstepChannel(RosChannel):
         """Check one message; return whether it is an answer that was missing."""
         try:
             message = self._decoded(data, Transmission, TRANSMISSION.read_fields)
-            self.roster.check_sender(message.agent, self.loop.sender)
+            at = self.roster.check_sender(message.agent, self.loop.sender)
             if message.slot < slot:
                 return False  # an answer that was asked for twice
             if message.slot > slot:
                 raise BadMessage(
                     SLOT, f"{agent_names(message.agent)} answered slot {message.slot}, which has not begun"
                 )
-            return self.answers.add(message)
+            return self.answers.add(at, message)
         except BadMessage as error:
             self.intake.drop(error.reason, str(error))
-            if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent of this run sent it
+            # A stranger's garbage is no reason to give an agent up.
+            if error.reason not in (OTHER_RUN, OTHER_SENDER) and self.roster.is_member(self.loop.sender):
                 self._complaint, self._complaint_time = str(error), time.monotonic()
             return False

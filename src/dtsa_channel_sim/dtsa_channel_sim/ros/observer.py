@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -23,16 +21,8 @@ class ObserverError(DtsaError):
         super().__init__(f"{type(observer).__name__} failed: {type(error).__name__}: {error}")
 
 
-@dataclass(frozen=True, slots=True)
-class ChannelStatus:
-    """How the channel is doing."""
-
-    slot: int  # the last one opened (lockstep) or closed (real time); -1: none yet
-    awaited: list[int]  # ids of the agents whose answers are missing
-
-
 class ChannelObserver:
-    """Events of a run. An observer derives from this class and overrides those that it needs; the rest costs nothing.
+    """Events of a run. An observer derives from this class and overrides those that it needs.
 
     Observers are called in the order in which they were added. None of them can change what happens on the air. A slot
     passes in this order: ``all_answered``, ``arbitrated``, ``slot_over``. Answers are valid during the call.
@@ -50,8 +40,8 @@ class ChannelObserver:
     def all_answered(self, slot: int, answers: Answers) -> None:
         """All connected agents have answered a slot, with the true motion during the slot before."""
 
-    def arbitrated(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
-        """The air has carried a slot's frames, by the sender's id."""
+    def arbitrated(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        """The air has carried a slot's frames, those in ``answers``."""
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         """The slot is over: time for what no agent waits for."""
@@ -65,8 +55,12 @@ class ChannelObserver:
     def settings_changed(self, change: Change) -> None:
         """A setting of the channel has been changed while it runs."""
 
-    def idle(self, status: ChannelStatus) -> None:
-        """Called about ten times a second, also while nothing comes in; a DtsaError ends the run."""
+    def idle(self, slot: int, awaited: list[int]) -> None:
+        """Called about ten times a second, also while nothing comes in; a DtsaError ends the run.
+
+        :param slot: the last one opened (lockstep) or closed (real time); -1: none yet.
+        :param awaited: ids of the agents whose answers are missing.
+        """
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
         """The run is over after this slot (-1: none), by an error if ``failed``; called once, before ``close``."""
@@ -79,16 +73,18 @@ class Observers(ChannelObserver):
     """Passes every event on to any number of observers; an error of one that is no DtsaError names it."""
 
     def __init__(self) -> None:
-        self._calls: dict[str, list[Callable[..., None]]] = {}  # those that observe an event, by its name
+        self._observers: list[ChannelObserver] = []
+        for event in vars(ChannelObserver):
+            if event[0] != "_" and event != "close":
+                setattr(self, event, partial(self._notify, event))
 
-    def add(self, observer: ChannelObserver) -> None:
-        """Add an observer; it is called after those that are there already."""
-        for name, nothing in vars(ChannelObserver).items():
-            if name[0] != "_" and getattr(type(observer), name) is not nothing:
-                calls = self._calls.setdefault(name, [])
-                calls.append(_naming(observer, getattr(observer, name)))
-                if name != "close":
-                    setattr(self, name, calls[0] if len(calls) == 1 else partial(_in_turn, calls))
+    def add(self, *observers: ChannelObserver) -> None:
+        """Add observers; they are called in this order, after those that are there already."""
+        self._observers += observers
+
+    def _notify(self, event: str, *arguments: Any) -> None:
+        for observer in self._observers:
+            _call(observer, event, *arguments)
 
     def close(self) -> None:
         """Close all observers, once, also when some of them fail.
@@ -96,22 +92,14 @@ class Observers(ChannelObserver):
         :raises DtsaError: a failure.
         """
         with ExitStack() as stack:
-            for call in reversed(self._calls.pop("close", [])):
-                stack.callback(call)
+            while self._observers:
+                stack.callback(_call, self._observers.pop(), "close")
 
 
-def _naming(observer: ChannelObserver, event: Callable[..., None]) -> Callable[..., None]:
-    def call(*arguments: Any) -> None:
-        try:
-            event(*arguments)
-        except DtsaError:
-            raise
-        except Exception as error:
-            raise ObserverError(observer, error) from error
-
-    return call
-
-
-def _in_turn(calls: list[Callable[..., None]], *arguments: Any) -> None:
-    for call in calls:
-        call(*arguments)
+def _call(observer: ChannelObserver, event: str, *arguments: Any) -> None:
+    try:
+        getattr(observer, event)(*arguments)
+    except DtsaError:
+        raise
+    except Exception as error:
+        raise ObserverError(observer, error) from error

@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from dtsa_channel_sim.model.air import NEVER, FrameVerdict, LiveAir
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .answers import Accounts, Answers
+from .answers import Accounts, Answers, check_report, places_of
 from .ros_channel import RosChannel
 
 _NS = 1_000_000_000
@@ -115,7 +116,6 @@ class RealtimeChannel(RosChannel):
         self.air = LiveAir(channel)
         self.pace = Pace(self.slot_ns)
         self.round_ms: float | None = None  # of the last round of messages before slot 0
-        self.returned: set[int] = set()  # ids of agents that were lost, and report again
         self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
         self._heard_ns = np.zeros(self.agents, dtype=np.int64)  # when each was heard last
         self._steps = steps
@@ -171,22 +171,14 @@ class RealtimeChannel(RosChannel):
         """Wait until all agents have reported, and publish when slot 0 starts; return False when stopped."""
         if not self._call(stop, self.lost):
             return False
-        accounts = Accounts(self.agents, self._steps, 1)
-        awaited = set(range(1, self.agents + 1))
 
         def still_awaited() -> set[int]:
-            awaited.difference_update(self._answered_call(names.FIRST_CALL, accounts))
-            self.answers.missing = len(awaited)
-            self.answers.answered[:] = [agent not in awaited for agent in range(1, self.agents + 1)]
-            return awaited - self.lost
+            self._answered_call(names.FIRST_CALL)
+            return set(self.answers.silent) - self.lost
 
         if not self._await_all(stop, still_awaited, _TICK_NS):
             return False
-        # An agent that is late with its first report has been nowhere else.
-        answers = accounts[names.FIRST_CALL]
-        answers.carry(self.answers)
-        self.answers = answers
-        self._await_short_round(stop, accounts)
+        self._await_short_round(stop)
         if stop:
             return False
         self._zero = time.monotonic_ns() + _LEAD_NS
@@ -195,21 +187,24 @@ class RealtimeChannel(RosChannel):
         self._heard_ns[:] = 0
         return True
 
-    def _answered_call(self, number: int, accounts: Accounts) -> set[int]:
-        """Return the agents whose answers to a call of this number have come since this was asked."""
+    def _answered_call(self, number: int) -> set[int]:
+        """Return the agents whose answers to a call of this number have come since this was asked.
+
+        The first answer of each says where it is: one that is late with its first report has been nowhere else.
+        """
         present: set[int] = set()
-        for _ in range(_BURST):
-            data = self._reports.take()
-            if data is None:
-                break
+        for data in islice(iter(self._reports.take, None), _BURST):
             with suppress(Exception):  # rclpy has no common base for what a message can do to it
                 message = read_report(data)
                 if message.run == self.run_id and message.slot.tolist() == [number]:
-                    accounts.add(message, number)
+                    at = places_of(message.agent, self.agents)
+                    check_report(message, self._steps)
+                    if not self.answers.answered[at].any():
+                        self.answers.add_report(at, message, 0)
                     present.update(message.agent)
         return present
 
-    def _await_short_round(self, stop: object, accounts: Accounts) -> None:
+    def _await_short_round(self, stop: object) -> None:
         """Call until a round of messages, from a call to the last answer, is short enough, or for some seconds.
 
         Many processes may have found the channel and still look for each other.
@@ -221,7 +216,7 @@ class RealtimeChannel(RosChannel):
             self._publish_call(number)
             while awaited and time.monotonic() < begin_s + _LONGEST_S:
                 time.sleep(_PAUSE_S)
-                awaited -= self._answered_call(number, accounts)
+                awaited -= self._answered_call(number)
             self.round_ms = (time.monotonic() - begin_s) * 1e3
             if not self.tight:
                 return
@@ -317,8 +312,6 @@ class RealtimeChannel(RosChannel):
         check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
         if not self.air.hand_over((slot, agent), start_ns, frame):
             return
-        if slot > self.slot:
-            self.accounts[slot].frames[agent] = frame
         self._observers.frame_sent(slot, agent, frame, start_ns)
         self._hear((agent,), now)
 
@@ -327,7 +320,9 @@ class RealtimeChannel(RosChannel):
         for verdict in self.air.pop_arrived(now, self.answers.position):
             slot, sender = verdict.frame_id
             self._resolved.setdefault(max(slot, self.slot + 1), []).append(verdict)
-            self.pace.lag.add(self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns))
+            lag_ns = self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns)
+            self.pace.lag.add(lag_ns)
+            self.lag_ms = lag_ns / 1e6
             if not verdict.received.any():
                 continue
             frame = self.air.frames[verdict.frame_id]
@@ -354,11 +349,11 @@ class RealtimeChannel(RosChannel):
         """
         if self.lost and not self.lost.isdisjoint(message.agent[: self.agents]):
             self._meet_processes()
-        self.roster.check_sender(message.agent, self._reports.sender)
+        at = self.roster.check_sender(message.agent, self._reports.sender)
         now = self._now()
         if len(message.slot) and message.slot[0] >= names.FIRST_CALL:
             return  # an answer to a call, which has come late
-        self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
+        self._newest = max(self._newest, self.accounts.add(at, message, now // self.slot_ns + _AHEAD))
         self._hear(message.agent, now)
         self._observers.report(message)
 
@@ -369,8 +364,8 @@ class RealtimeChannel(RosChannel):
             return False
         if now >= max(end + self._patience_ns, self._recovered_ns):
             return True
-        silent = self.accounts.silent(self.slot + 2)
-        return silent is not None and not set(silent) - self.lost
+        book = self.accounts[self.slot + 2]
+        return bool(book.answered.any()) and not set(book.silent) - self.lost
 
     def _close_slot(self) -> bool:
         """Tell the observers of a slot that has passed; return False when the run is over."""
@@ -380,10 +375,9 @@ class RealtimeChannel(RosChannel):
             return False
         self.answers = book
         resolved = self._resolved.pop(slot, [])
-        frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in resolved}
+        book.frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in resolved}
         verdict = Verdict.of([verdict.sender for verdict in resolved], resolved)
-        book.receipts = self.accounts.receipts(slot)
-        self._observers.arbitrated(slot, book, frames, verdict)
+        self._observers.arbitrated(slot, book, verdict)
         self._publish_clock(names.slot_time_ns(slot, self.slot_ns))
         self._observers.slot_over(slot, book, verdict)
         self.slot = slot

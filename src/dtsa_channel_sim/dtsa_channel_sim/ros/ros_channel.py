@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import time
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Set
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Set
+from itertools import islice
 from typing import Any
 
 from dtsa_msgs.msg import Process, Slot
@@ -23,10 +23,9 @@ from dtsa_agent.ros.common.messages import SLOT, time_of
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_agent.ros.common.runs import Patience, Run, run_text
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.schedule import Change
 
 from .answers import Answers
-from .observer import ChannelObserver, ChannelStatus, Observers
+from .observer import ChannelObserver, Observers
 from .roster import Roster
 
 REPEAT_S = 0.1
@@ -66,10 +65,12 @@ class RosChannel:
         self.intake = Intake(node.get_logger())
         self.slot = -1
         self.answers = Answers(self.agents, steps)
-        self.lost: set[int] = set()  # ids of agents that have fallen silent
+        self.lost: set[int] = set()  # ids of agents that have fallen silent; real time only
+        self.returned: set[int] = set()  # ids of agents that had, and report again; real time only
         self._observers = Observers()
         self._over, self._slots = over, slots
         self.fell_behind = ""  # why the run could not go on; real time only
+        self.lag_ms = 0.0  # by which the last frame was delivered late; real time only
         self._reason, self._failed = "", False  # why the run has ended, and whether an error ended it
         self._startup_s, self._end_s = startup_s, end_s
         self._publisher = node.create_publisher(Slot, f"{swarm_namespace}/{names.SLOT}", names.lockstep_qos(waiting))
@@ -96,12 +97,14 @@ class RosChannel:
 
     def observe(self, *observers: ChannelObserver) -> None:
         """Add observers; they are called in this order, after those that are there already."""
-        for observer in observers:
-            self._observers.add(observer)
+        self._observers.add(*observers)
 
-    def change_settings(self, change: Change) -> None:
-        """Tell the observers of a change of the medium's settings."""
-        self._observers.settings_changed(change)
+    def change_settings(self, **values: Any) -> None:
+        """Change settings of the medium from the next slot on, and tell the observers.
+
+        :raises ConfigError: for values that are not allowed.
+        """
+        self._observers.settings_changed(self.model.set(**values))
 
     def run(self, stop: object) -> None:
         """Run until the run is over or ``stop`` is true. The agents are told to end.
@@ -130,14 +133,19 @@ class RosChannel:
         :raises ConfigError: when two do not fit together, or another channel is there.
         :raises LocalProtocolError: when some do not answer in time.
         """
-        with self._watch_other_channels() as check_others:
+        others = Feed(self.node, Slot, self._publisher.topic_name, names.lockstep_qos(), intake=self.intake)
+        first_s: dict[int, float] = {}  # by another run: when its first message came
 
-            def awaited() -> set[int]:
-                self._read_processes()
-                check_others()
-                return self.roster.awaited(time.monotonic(), absent)
+        def awaited() -> set[int]:
+            self._read_processes()
+            self._check_other_channels(others, first_s)
+            return self.roster.awaited(time.monotonic(), absent)
 
+        try:
             self.roster.closed = self._await_all(stop, awaited, _CALL_NS)
+        finally:
+            others.close()
+            self.node.destroy_subscription(others.subscription)
         return self.roster.closed
 
     def _publish_call(self, number: int) -> None:
@@ -166,35 +174,24 @@ class RosChannel:
                 )
         return True
 
-    @contextmanager
-    def _watch_other_channels(self) -> Iterator[Callable[[], None]]:
-        """Listen to the channel's own topic; give a function that checks what others publish there."""
-        topic = self._publisher.topic_name
-        feed = Feed(self.node, Slot, topic, names.lockstep_qos(), intake=self.intake)
-        first_s: dict[int, float] = {}  # by run: when its first message came
+    def _check_other_channels(self, feed: Feed, first_s: dict[int, float]) -> None:
+        """Check what others publish on the channel's own topic.
 
-        def check() -> None:
-            for _ in range(_MOST_PROCESSES):
-                message = feed.take()
-                if message is None:
-                    return
-                if message.run in (0, self.run_id) or len(first_s) >= _MOST_PROCESSES:
-                    continue
-                with self.intake.guard():
-                    checks.check_slot(message, self.agents)
-                    now = time.monotonic()
-                    waited_s = now - first_s.setdefault(message.run, now)
-                    if waited_s > _OTHER_CHANNEL_S:
-                        others = self._other_nodes(topic)
-                        if others or waited_s > _OTHER_CHANNEL_S + _NAME_S:
-                            allowed = f"no other channel on {topic}; there is {others or 'a node without a name yet'}"
-                            raise ConfigError("run", str(self._identity), allowed)
-
-        try:
-            yield check
-        finally:
-            feed.close()
-            self.node.destroy_subscription(feed.subscription)
+        :raises ConfigError: when another channel is there.
+        """
+        for message in islice(iter(feed.take, None), _MOST_PROCESSES):
+            if message.run in (0, self.run_id) or len(first_s) >= _MOST_PROCESSES:
+                continue
+            with self.intake.guard():
+                checks.check_slot(message, self.agents)
+                now = time.monotonic()
+                waited_s = now - first_s.setdefault(message.run, now)
+                if waited_s > _OTHER_CHANNEL_S:
+                    topic = self._publisher.topic_name
+                    others = self._other_nodes(topic)
+                    if others or waited_s > _OTHER_CHANNEL_S + _NAME_S:
+                        allowed = f"no other channel on {topic}; there is {others or 'a node without a name yet'}"
+                        raise ConfigError("run", str(self._identity), allowed)
 
     def _other_nodes(self, topic: str) -> str:
         """Return the nodes that publish on a topic beside this one; empty: the graph does not know their names yet."""
@@ -231,10 +228,7 @@ class RosChannel:
 
         :raises ConfigError: before the run has begun, when two do not fit together.
         """
-        for _ in range(_MOST_PROCESSES):
-            message = self._processes.take()
-            if message is None:
-                return
+        for message in islice(iter(self._processes.take, None), _MOST_PROCESSES):
             with self.intake.guard():
                 try:
                     self.roster.hear(message, time.monotonic(), self._processes.sender)
@@ -261,7 +255,7 @@ class RosChannel:
             self._clock_watched = self._clock.get_subscription_count() > 0
             self._meet_processes()
             awaited = self.answers.silent if self.roster.closed else self.roster.missing
-            self._observers.idle(ChannelStatus(self.slot, awaited))
+            self._observers.idle(self.slot, awaited)
 
     def _goes_on(self, slot: int, answers: Answers) -> bool:
         """All agents have answered a slot; return whether the run goes on."""

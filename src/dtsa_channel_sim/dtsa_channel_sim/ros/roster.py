@@ -17,6 +17,8 @@ from dtsa_agent.ros.common.checks import BadMessage
 from dtsa_agent.ros.common.names import agent_names
 from dtsa_agent.ros.common.runs import run_text
 
+from .answers import Places, places_of
+
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s
 _LEFT_OVER_S = 3.0  # agents whose channel has gone end within this time
@@ -29,9 +31,10 @@ class Member:
 
     process: int
     node: str
-    ids: tuple[int, ...]
+    ids: array[int]
     heard_s: float  # monotonic, when its last message about itself came
     sender: bytes | None  # participant of all its messages; None: not known
+    places: Places
     dropped: dict[str, int] = field(default_factory=dict)
 
 
@@ -47,7 +50,6 @@ class Roster:
         self._agreed = {name: (value, channel) for name, value in agreed.items()}  # and the node that has said so
         self._members: dict[int, Member] = {}  # by process
         self._of: dict[int, Member] = {}  # by agent
-        self._groups: dict[bytes, Member] = {}  # by the ids of all agents of a process, as messages carry them
         self._rivals: dict[int, tuple[Member, float]] = {}  # processes that claim agents of a member, since when
         self._left_over: dict[int, float] = {}  # processes of another run, since when
         self._gone: Counter[str] = Counter()  # what processes that have been replaced had dropped
@@ -97,7 +99,7 @@ class Roster:
         member = self._members.get(message.process) or self._meet(message, now_s, sender)
         if member.sender != sender:
             raise BadMessage(checks.OTHER_SENDER, f"a message about {message.node} that is not its own")
-        if member.ids != tuple(message.agent):
+        if member.ids != message.agent:
             raise BadMessage(checks.UNKNOWN, f"{message.node} for other agents than before")
         member.heard_s = now_s
         member.dropped = dict(zip(message.dropped_reason, message.dropped, strict=True))
@@ -110,7 +112,8 @@ class Roster:
         """A process publishes about itself for the first time."""
         if message.process in self._rivals:
             return self._rivals[message.process][0]
-        member = Member(message.process, message.node, tuple(message.agent), now_s, sender)
+        places = places_of(message.agent, self._agents)
+        member = Member(message.process, message.node, message.agent, now_s, sender, places)
         self._compare(message)
         if self._of.keys().isdisjoint(member.ids):
             self._replace(member)
@@ -125,10 +128,9 @@ class Roster:
         for before in [self._of[agent] for agent in member.ids if agent in self._of]:
             if self._members.pop(before.process, None):
                 self._gone.update(before.dropped)
-                del self._groups[_key(before.ids)]
                 for other in before.ids:
                     self._of.pop(other, None)
-        self._members[member.process] = self._groups[_key(member.ids)] = member
+        self._members[member.process] = member
         self._of.update(dict.fromkeys(member.ids, member))
 
     def _conflict(self, rival: Member, taken: Set[int]) -> ConfigError:
@@ -167,9 +169,14 @@ class Roster:
             allowed = f"no process of another run on these topics; it has {agent_names(message.agent)}"
             raise ConfigError(f"run of {message.node}", run_text(message.run), allowed)
 
-    def check_sender(self, ids: Any, sender: bytes | None) -> None:
-        """Check that a message can be from the process that has some agents."""
-        _admit(self._groups.get(ids.tobytes()), ids, sender)
+    def check_sender(self, ids: Any, sender: bytes | None) -> Places:
+        """Check that a message can be from the process that has some agents; return their places."""
+        member = self._of.get(ids[0]) if ids else None
+        return _admit(member if member is not None and member.ids == ids else None, ids, sender).places
+
+    def is_member(self, sender: bytes | None) -> bool:
+        """Whether a sender is a process of this run."""
+        return any(member.sender == sender for member in self._members.values())
 
     def check_frame(self, agent: int, sender: bytes | None) -> None:
         """Check that a frame can be from the process that has its sender."""
@@ -183,13 +190,10 @@ class Roster:
         return total
 
 
-def _admit(member: Member | None, ids: Any, sender: bytes | None) -> None:
+def _admit(member: Member | None, ids: Any, sender: bytes | None) -> Member:
     if member is None:
         raise BadMessage(checks.UNKNOWN, f"a message for {agent_names(ids[:8])}, which no process has")
     if sender != member.sender:
         detail = f"a message for {agent_names(ids[:8])} that is not of {member.node}"
         raise BadMessage(checks.OTHER_SENDER, detail)
-
-
-def _key(ids: tuple[int, ...]) -> bytes:
-    return array("H", ids).tobytes()
+    return member

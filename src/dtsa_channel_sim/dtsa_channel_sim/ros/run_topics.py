@@ -20,7 +20,7 @@ from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Answers
-from .observer import ChannelObserver, ChannelStatus
+from .observer import ChannelObserver
 from .ros_channel import RosChannel
 
 _STATUS_S = 1.0  # wall time from one status to the next while nothing changes
@@ -39,74 +39,51 @@ def configuration_message(settings: Mapping[str, Any], run_id: int) -> Configura
     )
 
 
-class RunState:
-    """The status of a run, a dtsa_msgs/RunStatus, by what happens."""
-
-    def __init__(self, run_id: int, slot_ns: int) -> None:
-        self.message, self._slot_ns = RunStatus(run=run_id, phase=RunStatus.WAITING), slot_ns
-
-    def reach(self, slot: int, **changed: Any) -> None:
-        """Note that a run has come to a slot, -1: none yet, and fields that have changed."""
-        self.message.slot = max(0, slot)
-        self.message.header = header_of(names.slot_time_ns(self.message.slot, self._slot_ns))
-        for name, value in changed.items():
-            setattr(self.message, name, value)
-        if self.message.phase != RunStatus.WAITING:
-            self.message.awaited = []
-
-    def lose(self, agent: int) -> None:
-        """Note that an agent has fallen silent."""
-        self._move([agent], "returned", "lost")
-
-    def regain(self, agents: list[int]) -> None:
-        """Note that agents report again."""
-        self._move(agents, "lost", "returned")
-
-    def _move(self, agents: list[int], source: str, to: str) -> None:
-        setattr(self.message, source, sorted(set(getattr(self.message, source)) - set(agents)))
-        setattr(self.message, to, sorted({*getattr(self.message, to), *agents}))
+def status_message(channel: RosChannel, phase: int, slot: int, **more: Any) -> RunStatus:
+    """Return a dtsa_msgs/RunStatus of a run that has come to a slot, -1: none yet."""
+    return RunStatus(
+        header=header_of(names.slot_time_ns(max(0, slot), channel.slot_ns)),
+        run=channel.run_id, phase=phase, slot=max(0, slot),
+        lost=sorted(channel.lost), returned=sorted(channel.returned), **more,
+    )  # fmt: skip
 
 
 class RunTopics(ChannelObserver):
     """Publishes ``configuration`` and ``status`` in the swarm's namespace, transient local, for late subscribers."""
 
-    def __init__(
-        self, node: Node, settings: Mapping[str, Any], run_id: int, slot_ns: int, swarm_namespace: str = names.SWARM
-    ) -> None:
-        qos = names.latched_qos()
+    def __init__(self, node: Node, settings: Mapping[str, Any], channel: RosChannel, swarm_namespace: str) -> None:
+        qos, self._channel = names.latched_qos(), channel
         self._settings = node.create_publisher(Configuration, f"{swarm_namespace}/{names.CONFIGURATION}", qos)
-        self._settings.publish(configuration_message(settings, run_id))
+        self._settings.publish(configuration_message(settings, channel.run_id))
         self._status = node.create_publisher(RunStatus, f"{swarm_namespace}/{names.STATUS}", qos)
-        self._state = RunState(run_id, slot_ns)
-        self._state.reach(0)
+        self._phase, self._slot, self._awaited = RunStatus.WAITING, -1, list[int]()
         self._publish()
 
-    def _publish(self) -> None:
+    def _publish(self, reason: str = "") -> None:
         self._next_s = time.monotonic() + _STATUS_S
-        self._status.publish(self._state.message)
+        values = {"awaited": self._awaited, "lag_ms": self._channel.lag_ms, "reason": reason}
+        self._status.publish(status_message(self._channel, self._phase, self._slot, **values))
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         if not slot:
-            self._state.reach(0, phase=RunStatus.FLYING)
+            self._phase, self._slot, self._awaited = RunStatus.FLYING, 0, []
             self._publish()
 
     def agent_silent(self, agent: int) -> None:
-        self._state.lose(agent)
         self._publish()
 
     def agents_back(self, agents: list[int]) -> None:
-        self._state.regain(agents)
         self._publish()
 
-    def idle(self, status: ChannelStatus) -> None:
-        before = list(self._state.message.awaited)
-        self._state.reach(status.slot, awaited=status.awaited)
-        if before != list(self._state.message.awaited) or time.monotonic() >= self._next_s:
+    def idle(self, slot: int, awaited: list[int]) -> None:
+        before, self._slot = self._awaited, slot
+        self._awaited = awaited if self._phase == RunStatus.WAITING else []
+        if before != self._awaited or time.monotonic() >= self._next_s:
             self._publish()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
-        self._state.reach(slot, phase=RunStatus.ENDED, reason=reason)
-        self._publish()
+        self._phase, self._slot, self._awaited = RunStatus.ENDED, slot, []
+        self._publish(reason)
 
 
 class Diagnostics(ChannelObserver):
@@ -117,19 +94,19 @@ class Diagnostics(ChannelObserver):
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._ticks = 0
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         self._ticks += 1
         if self._ticks % 10 or not self._publisher.get_subscription_count():
             return
         dropped = self._channel.dropped()
-        values = {"agents awaited": status.awaited, "not taken in": sum(dropped.values())}
+        values = {"agents awaited": awaited, "not taken in": sum(dropped.values())}
         values |= {f"not taken in: {reason}": count for reason, count in sorted(dropped.items())}
         message = DiagnosticStatus(
             level=DiagnosticStatus.WARN if dropped else DiagnosticStatus.OK,
-            name=self._name, message=f"slot {status.slot}", hardware_id="simulated",
+            name=self._name, message=f"slot {slot}", hardware_id="simulated",
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )  # fmt: skip
-        header = header_of(names.slot_time_ns(max(0, status.slot), self._channel.slot_ns))
+        header = header_of(names.slot_time_ns(max(0, slot), self._channel.slot_ns))
         self._publisher.publish(DiagnosticArray(header=header, status=[message]))
 
 
@@ -160,7 +137,7 @@ class Transforms(ChannelObserver):
             translation.x, translation.y, translation.z = place
         self._publisher.publish(self._kind(transforms=self._transforms))
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         self._watched = self._publisher.get_subscription_count() > 0
 
 
@@ -180,15 +157,15 @@ class RunLog(ChannelObserver):
             self._flying = True
             self._logger.info("slot 0: all agents have answered, the run starts")
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         if not self._flying:
-            if status.awaited:
-                self._waiting.log(f"waiting for {agent_names(status.awaited)} to answer")
-        elif status.slot != self._slot or not status.awaited:
-            self._slot, self._since_s = status.slot, time.monotonic()
+            if awaited:
+                self._waiting.log(f"waiting for {agent_names(awaited)} to answer")
+        elif slot != self._slot or not awaited:
+            self._slot, self._since_s = slot, time.monotonic()
         elif self._lockstep and time.monotonic() - self._since_s > _SLOW_S:
             self._since_s = float("inf")
-            self._logger.warning(f"slot {status.slot}: still waiting for {agent_names(status.awaited)}")
+            self._logger.warning(f"slot {slot}: still waiting for {agent_names(awaited)}")
 
     def agent_silent(self, agent: int) -> None:
         self._logger.warning(f"{agent_names([agent])} is lost: it has not been heard of for a while")

@@ -14,7 +14,7 @@ SECOND = 1_000_000_000  # ns
 # Where the run's id lies in the messages that carry one, as CDR: after 4 bytes of representation and a header in frame
 # "map". It is random, and so outside all that is compared between flights.
 RUN_BYTES = slice(20, 24)
-_WITH_RUN = "Slot Transmission Frame Report Reception Decision Configuration RunStatus SlotRecord"
+_WITH_RUN = "Slot Transmission Frame Report Configuration RunStatus SlotRecord"
 RUN_MESSAGES = frozenset(f"dtsa_msgs/msg/{name}" for name in _WITH_RUN.split())
 
 

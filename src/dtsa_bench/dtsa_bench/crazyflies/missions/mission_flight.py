@@ -37,7 +37,7 @@ from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_bench.runs.options import new_directory, whole_number
 from dtsa_bench.runs.program import end_process, program
 from dtsa_channel_sim.ros.channel_node import declare_channel
-from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .ground_station import GroundStation
@@ -58,7 +58,7 @@ class MissionWatch(ChannelObserver):
     def __init__(self, mission: GroundStation, channel: RealtimeChannel, metrics: FlightMetrics | None) -> None:
         self._mission, self._channel, self._metrics = mission, channel, metrics
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         self._mission.check_bridge_process()
         ended, metrics = self._mission.ended, self._metrics
         if metrics is not None and metrics.collided_pair and not ended.reason:

@@ -18,4 +18,8 @@ class UnusableBag(ConfigError):
         self.reason = reason
 
     def __reduce__(self) -> tuple[type[UnusableBag], tuple[object, str]]:  # type: ignore[override]
-        return (UnusableBag, (self.value, self.reason))
+        return (type(self), (self.value, self.reason))
+
+
+class NothingWritten(UnusableBag):
+    """A process was started, and ended before it wrote anything."""

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import IO, Any
+from typing import Any
 
 import yaml
 import zstandard
 from mcap.records import Metadata
-from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from .errors import UnusableBag
 
@@ -25,7 +23,6 @@ RECORD_KEY = "serialized_metadata"
 RUN_ID = "run"  # name of the run's id in custom data, 8 hexadecimal digits
 MERGED_FROM = "merged_from"  # custom data of a bag that was made from the bags of agents on a network, as JSON
 RECOVERED_FROM = "recovered_from"  # custom data of a bag that `recover` has made: name of the damaged file
-MAX_UNPACKED_BYTES = 1 << 36  # of a file that is compressed as a whole
 MAX_MESSAGE_BYTES = 1 << 30  # of a message that is compressed by itself; for one that does not say its size
 
 Profile = dict[str, Any]  # quality of service of a publisher, with the fields of rosbag2
@@ -77,30 +74,6 @@ def find_files(path: str | Path) -> list[Path]:
     return [found[name] for name in names]
 
 
-def open_file(path: Path) -> IO[bytes]:
-    """A bag's file, open for reading; one that is compressed as a whole is unpacked, as far as that is possible.
-
-    :raises UnusableBag: if it cannot be read, or is too large.
-    """
-    try:
-        if path.suffix != ".zstd":
-            return path.open("rb")
-        with ExitStack() as stack:
-            unpacked = stack.enter_context(TemporaryFile())
-            # Of a damaged file the beginning is unpacked.
-            with path.open("rb") as packed, suppress(zstandard.ZstdError):
-                reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-                while block := reader.read(1 << 20):
-                    unpacked.write(block)
-                    if unpacked.tell() > MAX_UNPACKED_BYTES:
-                        raise UnusableBag(path, f"it is larger than {MAX_UNPACKED_BYTES >> 30} GiB when unpacked")
-            unpacked.seek(0)
-            stack.pop_all()
-            return unpacked
-    except OSError as error:
-        raise UnusableBag(path, f"cannot be read: {error.strerror or error}") from None
-
-
 # -- metadata ---------------------------------------------------------------------------------------------------------
 _TextLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # every value as it is written: 1.10 and 007 stay texts
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -128,8 +101,8 @@ def load(text: str) -> dict[str, Any]:
 
 
 def load_record(record: Metadata) -> dict[str, Any]:
-    """What rosbag2's metadata record inside a file says."""
-    return load(record.metadata.get(RECORD_KEY, ""))
+    """What rosbag2's metadata record inside a file says, without what it leaves empty."""
+    return {key: value for key, value in load(record.metadata.get(RECORD_KEY, "")).items() if value}
 
 
 def read(directory: Path) -> dict[str, Any]:
@@ -177,11 +150,6 @@ def write(directory: Path, content: Mapping[str, Any]) -> None:
 
 # -- quality of service -----------------------------------------------------------------------------------------------
 INFINITE = {"sec": 9223372036, "nsec": 854775807}  # the middleware's "for ever", as rosbag2 splits it
-_POLICIES = {
-    "history": QosHistory, "reliability": QosReliability, "durability": QosDurability, "liveliness": QosLiveliness,
-}  # fmt: skip
-
-
 _PROFILE: Profile = {
     "history": "keep_last", "depth": 10, "reliability": "reliable", "durability": "volatile", "deadline": INFINITE,
     "lifespan": INFINITE, "liveliness": "automatic", "liveliness_lease_duration": INFINITE,
@@ -207,13 +175,6 @@ def load_profiles(text: str) -> tuple[Profile, ...]:
     Before Jazzy rosbag2 wrote policies as numbers.
     """
     try:
-        loaded = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError):
+        return tuple(dict(entry) for entry in dump_qos_v9(parse_qos(yaml.load(text, Loader=_Loader))))
+    except Exception:  # the library meets texts from outside with many kinds of errors
         return ()
-    profiles = [dict(entry) for entry in loaded if isinstance(entry, dict)] if isinstance(loaded, list) else []
-    for entry in profiles:
-        for name, policy in _POLICIES.items():
-            numbers = {member.value: member.name.lower() for member in policy}
-            if isinstance(entry.get(name), int):
-                entry[name] = numbers.get(entry[name], "unknown")
-    return tuple(profiles)

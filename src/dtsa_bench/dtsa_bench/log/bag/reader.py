@@ -9,34 +9,22 @@ from __future__ import annotations
 import heapq
 import json
 import struct
-import zlib
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, DataEnd, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
-from mcap.summary import Summary
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from dtsa_bench.runs.program import program
 
 from . import metadata
 from .errors import BagError, UnusableBag
-from .schema import Definition
+from .file import BagFile
+from .schema import READABLE, Topic, typestore_of
 
-MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
-PREFIX = struct.Struct("<BQ")  # opcode and length of every record
-_END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
-_ROS = "cdr/ros2msg"
 NOT_OF_ITS_TYPE = (SerdeError, AssertionError, IndexError, KeyError, ValueError, struct.error)  # of rosbags
 
 
@@ -51,19 +39,6 @@ class BagMessage(NamedTuple):
     data: bytes  # CDR, exactly as recorded
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """One topic of a bag."""
-
-    name: str
-    type: str  # "package/msg/Type"
-    count: int  # messages
-    profiles: tuple[metadata.Profile, ...]  # offered QoS
-    type_hash: str  # "RIHS01_...", or empty
-    definition: str  # message definition with all that it needs
-    encoding: str  # of messages and definition; "cdr/ros2msg" alone can be decoded
-
-
 class Bag:
     """A recorded run, open for reading. A context manager.
 
@@ -73,68 +48,40 @@ class Bag:
 
     def __init__(self, path: str | Path) -> None:
         self.given = Path(path)
-        self._paths = metadata.find_files(self.given)
-        self.path = self._paths[0]
+        paths = metadata.find_files(self.given)
+        self.path = paths[0]
         self.topics: dict[str, Topic] = {}
-        self._readers: list[SeekingReader] = []  # a file each
-        self.message_count = self.start_ns = self.end_ns = 0
-        records = [metadata.read_beside(self.path, self.given)]
+        about = metadata.read_beside(self.path, self.given)
         with ExitStack() as stack:
-            for part in self._paths:
-                reader = self._add_file(part, stack.enter_context(metadata.open_file(part)))
-                with suppress(Exception):  # of a damaged record: whatever the library meets, there is none then
-                    for record in reader.iter_metadata():
-                        if record.name == metadata.RECORD_NAME:
-                            records.insert(0, metadata.load_record(record))
-            if self.topics and all(topic.encoding != _ROS for topic in self.topics.values()):
+            self._files = [BagFile(part, self.given, stack) for part in paths]
+            for file in self._files:
+                self._add_file(file)
+                about |= file.about
+            if self.topics and all(topic.definition.encodings != READABLE for topic in self.topics.values()):
                 topic = next(iter(self.topics.values()))
-                why = f"topic {topic.name} is recorded as {topic.encoding}, not as {_ROS}: not a ROS 2 bag"
-                raise UnusableBag(self.given, why)
-            self._files = stack.pop_all()
-        self._has_packed_messages = any(map(metadata.has_packed_messages, records))
-        # Of the types that were decoded.
-        kinds = frozenset((topic.type, topic.definition, topic.encoding) for topic in self.topics.values())
-        self.typestore = shared_typestore(kinds)
+                why = f"recorded as {topic.definition.encodings}, not as {READABLE}: not a ROS 2 bag"
+                raise UnusableBag(self.given, f"topic {topic.name} is {why}")
+            self._stack = stack.pop_all()
+        statistics = [one for file in self._files if (one := file.summary.statistics) and one.message_count]
+        self.start_ns = min((one.message_start_time for one in statistics), default=0)
+        self.end_ns = max((one.message_end_time for one in statistics), default=0)
+        self._has_packed_messages = metadata.has_packed_messages(about)
+        self._typestores: dict[str, Typestore] = {}  # by topic
         #: The recorder's own texts; empty in a foreign bag.
-        self.custom_data = next(filter(None, map(metadata.custom_data, records)), {})
+        self.custom_data = metadata.custom_data(about)
 
-    def _add_file(self, path: Path, stream: IO[bytes]) -> SeekingReader:
+    def _add_file(self, file: BagFile) -> None:
         """Add what the index of a file says."""
-        if stream.read(len(MAGIC)) != MAGIC:
-            raise UnusableBag(self.given, f"{path.name} is not an MCAP file")
-        try:
-            stream.seek(-len(MAGIC), 2)
-            if stream.read() != MAGIC:
-                raise McapError("no end mark")
-            reader, summary = read_index(stream)
-            reader.get_header()
-            if summary is None or summary.statistics is None:
-                raise McapError("it has no index")
-            statistics = summary.statistics
-            if statistics.message_count and not summary.chunk_indexes:
-                raise McapError("its messages are not in indexed chunks")
-            counts = {number: count for number, count in statistics.channel_message_counts.items() if count}
-            _complete_channels(summary, counts, stream)
-        except Exception as error:  # the libraries meet damaged files with many kinds of errors
-            raise self._damaged(f"it was not closed, or is damaged ({error or type(error).__name__})") from None
-        for number, channel in sorted(summary.channels.items()):
-            self._add_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
-        if statistics.message_count:
-            start_ns = statistics.message_start_time
-            self.start_ns = min(self.start_ns, start_ns) if self.message_count else start_ns
-            self.end_ns = max(self.end_ns, statistics.message_end_time)
-        self.message_count += statistics.message_count
-        self._readers.append(reader)
-        return reader
-
-    def _add_topic(self, channel: Channel, schema: Schema | None, count: int) -> None:
-        definition, before = definition_of(channel, schema), self.topics.get(channel.topic)
-        profiles = metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))
-        self.topics[channel.topic] = Topic(
-            channel.topic, definition.name, count + (before.count if before else 0),
-            profiles or (before.profiles if before else ()), definition.type_hash, definition.text,
-            f"{definition.message_encoding}/{definition.encoding or 'no schema'}",
-        )  # fmt: skip
+        if file.index_fault:
+            raise self._damaged(f"it was not closed, or is damaged ({file.index_fault})")
+        summary = file.summary
+        for _, channel in sorted(summary.channels.items()):
+            topic = Topic.of_channel(channel, summary.schemas.get(channel.schema_id))
+            if before := self.topics.get(topic.name):
+                topic.profiles, topic.count = topic.profiles or before.profiles, before.count
+            self.topics[topic.name] = topic
+        for topic in self.topics.values():
+            topic.count += file.counts[topic.name]
 
     def _damaged(self, what: str) -> UnusableBag:
         return UnusableBag(self.given, f"{what}; `{program()} recover {self.given}` saves what can be read")
@@ -166,15 +113,13 @@ class Bag:
         for name in topics or ():
             self.topic(name)
         wanted = None if topics is None else set(topics)
-        parts = [self._messages(reader, wanted, start_ns, end_ns) for reader in self._readers]
+        parts = [self._messages(file, wanted, start_ns, end_ns) for file in self._files]
         return heapq.merge(*parts, key=lambda message: message.log_time_ns) if len(parts) > 1 else parts[0]
 
-    def _messages(
-        self, reader: SeekingReader, wanted: set[str] | None, start_ns: int, end_ns: int
-    ) -> Iterator[BagMessage]:
+    def _messages(self, file: BagFile, wanted: set[str] | None, start_ns: int, end_ns: int) -> Iterator[BagMessage]:
         unpack = metadata.unpack_message if self._has_packed_messages else bytes
         try:
-            for schema, channel, message in reader.iter_messages(wanted, starting_at=start_ns, ending_at=end_ns):
+            for schema, channel, message in file.reader.iter_messages(wanted, starting_at=start_ns, ending_at=end_ns):
                 kind, data = schema.name if schema else "", unpack(message.data)
                 yield BagMessage(channel.topic, kind, message.log_time, message.publish_time, message.sequence, data)
         except Exception as error:  # the libraries meet damage with many kinds of errors
@@ -190,17 +135,18 @@ class Bag:
             raise UnusableBag(self.given, f"it has no topic {name!r}; it has {names}")
         return self.topics[name]
 
-    def register(self, topic: Topic) -> None:
-        """Make the type of a topic's messages known.
+    def typestore(self, name: str) -> Typestore:
+        """The type of a topic's messages, and all that it needs.
 
-        :raises UnusableBag: if its definition cannot be used.
+        :raises UnusableBag: if the bag has no such topic, or its definition cannot be used.
         """
-        try:
-            if topic.encoding != _ROS:
-                raise ValueError(f"it is recorded as {topic.encoding}, not as {_ROS}")
-            register_type(self.typestore, topic.type, topic.definition)
-        except ValueError as error:
-            raise UnusableBag(self.given, f"topic {topic.name}, {topic.type}: {error}") from None
+        if name not in self._typestores:
+            topic = self.topic(name)
+            try:
+                self._typestores[name] = typestore_of(topic.definition)
+            except ValueError as error:
+                raise UnusableBag(self.given, f"topic {name}, {topic.type}: {error}") from None
+        return self._typestores[name]
 
     def decode(self, message: BagMessage) -> Any:
         """The message as an object with its fields as attributes; arrays of numbers are NumPy arrays.
@@ -208,10 +154,9 @@ class Bag:
         :raises UnusableBag: if its definition cannot be used.
         :raises BagError: if the bytes do not fit the type.
         """
-        if message.type not in self.typestore.fielddefs:
-            self.register(self.topic(message.topic))
+        store = self.typestore(message.topic)
         try:
-            return self.typestore.deserialize_cdr(message.data, message.type)
+            return store.deserialize_cdr(message.data, message.type)
         except NOT_OF_ITS_TYPE as error:
             what = f"{message.topic} at {message.log_time_ns} ns"
             raise BagError(f"{what}: not a valid {message.type} ({error})") from None
@@ -226,95 +171,16 @@ class Bag:
 
         :raises UnusableBag: if one is not.
         """
-        for path in self._paths:
-            if fault := checksum_fault(path):
-                raise self._damaged(f"{path.name}: {fault}")
+        for file in self._files:
+            if fault := file.checksum_fault():
+                raise self._damaged(f"{file.path.name}: {fault}")
 
     def close(self) -> None:
         """Close the files."""
-        self._files.close()
+        self._stack.close()
 
     def __enter__(self) -> Bag:
         return self
 
     def __exit__(self, *unused: object) -> None:
         self.close()
-
-
-def _complete_channels(summary: Summary, counts: Mapping[int, int], stream: IO[bytes]) -> None:
-    """Complete a summary that repeats no channels or schemas by those that stand before the messages."""
-    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
-        channels = [summary.channels.get(number) for number in counts]
-        if all(channel and channel.schema_id in (0, *summary.schemas) for channel in channels):
-            return
-        stream.seek(index.chunk_start_offset + PREFIX.size)
-        for record in breakup_chunk(Chunk.read(ReadDataStream(stream)), validate_crc=True):
-            if isinstance(record, Schema):
-                summary.schemas.setdefault(record.id, record)
-            elif isinstance(record, Channel):
-                summary.channels.setdefault(record.id, record)
-    if not counts.keys() <= summary.channels.keys():
-        raise McapError("the channels of some messages are not defined")
-
-
-@lru_cache(maxsize=16)
-def shared_typestore(definitions: frozenset[tuple[str, ...]]) -> Typestore:
-    """The types of bags with these definitions and encodings, empty at first: compiling them takes longer than reading.
-
-    Bags that differ in any of them share nothing: what is wrong with one says nothing of another.
-    """
-    return get_typestore(Stores.EMPTY)
-
-
-def register_type(store: Typestore, kind: str, definition: str) -> None:
-    """Make a type of messages known, by the definition of it and of all that it needs; not again if it is.
-
-    :raises ValueError: if the definition cannot be used.
-    """
-    if kind in store.fielddefs:
-        return
-    try:
-        types = get_types_from_msg(definition, kind)
-        store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
-        if kind not in store.fielddefs:
-            raise ValueError("it is not of the form package/msg/Type")
-    except Exception as error:  # the parser meets texts from outside with many kinds of errors
-        raise ValueError(f"its definition cannot be used: {error}".partition("\n")[0]) from None
-
-
-def checksum_fault(path: Path) -> str:
-    """What the checksums of a finished file say against it; empty: nothing. A change of any of its bytes shows."""
-    try:
-        with metadata.open_file(path) as stream:
-            read_index(stream)
-            stream.seek(-_END.size, 2)
-            index_start, *_ = _END.unpack(stream.read())
-            stream.seek(0)
-            records = StreamReader(stream, emit_chunks=True, validate_crcs=True).records
-            if not any(isinstance(record, DataEnd) for record in records) or stream.tell() != index_start:
-                return "the end of its messages is damaged"
-    except CRCValidationError:
-        return "its contents do not fit their checksum"
-    except Exception as error:  # the library meets damaged files with many kinds of errors
-        return f"it is damaged ({error or type(error).__name__})"
-    return ""
-
-
-def read_index(stream: IO[bytes]) -> tuple[SeekingReader, Summary | None]:
-    """A reader and the index at the end of a file, None if it has none; raises errors of any kind for a damaged one."""
-    stream.seek(-_END.size, 2)
-    start, _, checksum, _ = _END.unpack(stream.read())
-    stream.seek(start)
-    if start and checksum and zlib.crc32(stream.read()[:-12]) != checksum:  # it covers all that stands before it
-        raise McapError("its index does not fit its checksum")
-    stream.seek(0)
-    reader = SeekingReader(stream, validate_crcs=True)
-    return reader, reader.get_summary()
-
-
-def definition_of(channel: Channel, schema: Schema | None) -> Definition:
-    """What a file says of the type of a channel's messages."""
-    type_hash, encoding = channel.metadata.get("topic_type_hash", ""), channel.message_encoding
-    if schema is None:
-        return Definition("", "", type_hash, "", encoding)
-    return Definition(schema.name, schema.data.decode("utf-8", "surrogateescape"), type_hash, schema.encoding, encoding)

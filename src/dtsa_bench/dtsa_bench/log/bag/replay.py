@@ -16,7 +16,8 @@ from dtsa_agent.ros.common.names import message_class
 from . import schema
 from .errors import BagError
 from .metadata import PROFILES, Profile
-from .reader import Bag, BagMessage, Topic
+from .reader import Bag, BagMessage
+from .schema import Topic
 
 CLOCK = "/clock"
 CLOCK_NS = 10_000_000  # ns of wall time, longest time without a /clock message
@@ -113,15 +114,16 @@ class RosOutput:
         self._publishers: dict[str, Any] = {}
         for topic in topics:
             try:
-                if not topic.encoding.startswith("cdr/"):
-                    raise BagError(f"recorded as {topic.encoding}, not as cdr")
+                if topic.definition.message_encoding != "cdr":
+                    raise BagError(f"recorded as {topic.definition.encodings}, not as cdr")
                 installed = schema.installed(topic.type)
                 message_type = message_class(topic.type)
             except (BagError, ConfigError) as error:
                 warn(f"{topic.name} is left out: {error}")
                 continue
-            if topic.type_hash not in ("", installed.type_hash):
-                hashes = f"({topic.type_hash} / {installed.type_hash}); leave it out with --topics"
+            recorded_hash = topic.definition.type_hash
+            if recorded_hash not in ("", installed.type_hash):
+                hashes = f"({recorded_hash} / {installed.type_hash}); leave it out with --topics"
                 raise BagError(f"{topic.name}: the bag's {topic.type} differs from the installed one {hashes}")
             try:
                 profile = ros_profile(topic.profiles, topic.count)

@@ -13,7 +13,6 @@ import json
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 from time import monotonic
@@ -29,29 +28,15 @@ from dtsa_bench.runs.program import program
 
 from . import metadata
 from .errors import BagError
-from .schema import Definition, installed
+from .schema import Definition, Topic, installed
 
-COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
 FLUSH_S = 0.5
 BROKEN_OFF = "broken_off"  # key of custom_data of a bag of which a part is lost: log time up to which it is whole, ns
 KEY = "digest"  # name of the digest in custom_data
-_UNLIMITED = 1 << 62  # bytes: chunks end at marks
+_UNLIMITED = 1 << 62  # bytes: chunks end where `mark` ends them
 _RECORD_BYTES = 31  # bytes of a message record beside its data
 _TIMES = struct.Struct("<QQQ")
 _MASK = (1 << 128) - 1
-
-
-@dataclass(slots=True)
-class _Channel:
-    """A topic that is recorded."""
-
-    topic: str
-    key: bytes  # its name, as the digest takes it
-    definition: Definition
-    profiles: Sequence[metadata.Profile]
-    has_run: bool  # its messages carry the run's id
-    count: int = 0  # messages written
 
 
 class BagWriter:
@@ -60,12 +45,11 @@ class BagWriter:
     :param directory: where the bag is made; empty, or not there yet. Or the name of an .mcap file, for a bag of
         this file alone.
     :param config: configuration of the run, JSON types; None: the bag says nothing of its origin but `custom_data`.
-    :param compression: "zstd", "lz4" or "none", for the chunks of the .mcap.
+    :param compression: of the chunks of the .mcap.
     :param chunk_size: bytes, size at which a chunk is closed even if its half second is not over.
-    :param min_time_ns: ns, earliest log time that is accepted.
     :param marked: whether chunks end at a `mark` only; the recorder calls it after each step of the run.
     :param profile: MCAP's name for the conventions that topics and messages follow.
-    :raises ConfigError: if the directory is in use or the compression is unknown.
+    :raises ConfigError: if the directory is in use.
     :raises BagError: if the directory cannot be made or written to; likewise below, for a full disk or a closed bag.
     """
 
@@ -73,15 +57,12 @@ class BagWriter:
         self,
         directory: str | Path,
         config: Mapping[str, Any] | None,
-        compression: str = "zstd",
+        compression: CompressionType = CompressionType.ZSTD,
         chunk_size: int = 1 << 20,
         custom_data: Mapping[str, str] | None = None,
-        min_time_ns: int = MIN_TIME_NS,
         marked: bool = False,
         profile: str = "ros2",
     ) -> None:
-        if compression not in COMPRESSIONS:
-            raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
         self.directory = Path(directory)
         self._is_file = self.directory.suffix == ".mcap"
         if not self._is_file:
@@ -92,12 +73,10 @@ class BagWriter:
                 "project": "dtsa", "version": __version__, "configuration": json.dumps(config, sort_keys=True),
                 "seed": str({**config, **config.get("swarm", {})}.get("seed", "")),
             }  # fmt: skip
-        if marked:
-            self.custom_data["chunks"] = "complete steps"
-        self._marked, self._chunk_size, self._min_time_ns = marked, chunk_size, min_time_ns
+        self._marked, self._chunk_size = marked, chunk_size
         self._chunk_bytes = 0  # in the chunk that is being filled
         self.path = self.directory if self._is_file else self.directory / f"{self.directory.resolve().name}_0.mcap"
-        self._channels: list[_Channel] = []  # the channel's number - 1 is its index
+        self._topics: list[Topic] = []  # the channel's number - 1 is its index
         self._schemas: dict[Definition, int] = {}
         self._digest = BagDigest()
         self._start_ns, self._end_ns = 1 << 63, 0
@@ -109,7 +88,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         self._mcap = Writer(
-            self._stream, chunk_size=_UNLIMITED if marked else chunk_size, compression=COMPRESSIONS[compression],
+            self._stream, chunk_size=_UNLIMITED, compression=compression,
             enable_data_crcs=True,
         )  # fmt: skip
         with self._failing():
@@ -121,7 +100,7 @@ class BagWriter:
     @property
     def counts(self) -> dict[str, int]:
         """Messages written so far, by topic."""
-        return {channel.topic: channel.count for channel in self._channels}
+        return {topic.name: topic.count for topic in self._topics}
 
     @property
     def time_range_ns(self) -> tuple[int, int]:
@@ -139,7 +118,7 @@ class BagWriter:
         :raises ConfigError: if the topic is there already.
         """
         self._check_open()
-        if any(channel.topic == topic for channel in self._channels):
+        if any(known.name == topic for known in self._topics):
             raise ConfigError("topic", topic, "a name that is not in the bag yet")
         profiles = [metadata.PROFILES[qos]] if isinstance(qos, str) else list(qos)
         definition = definition or installed(type_name)
@@ -149,8 +128,7 @@ class BagWriter:
             schema = self._schemas[definition] = self._mcap.register_schema(type_name, definition.encoding, data)
         about = {"offered_qos_profiles": metadata.dump_profiles(profiles), "topic_type_hash": definition.type_hash}
         number = self._mcap.register_channel(topic, definition.message_encoding, schema, about)
-        has_run = type_name in RUN_MESSAGES
-        self._channels.append(_Channel(topic, topic.encode("utf-8", "replace"), definition, profiles, has_run))
+        self._topics.append(Topic(topic, definition, profiles))
         return number
 
     def write(
@@ -159,30 +137,27 @@ class BagWriter:
         """Record one message.
 
         :param data: the message as CDR, with its encapsulation header.
-        :param log_time_ns: ns, simulated time of reception, 1 s or later.
+        :param log_time_ns: ns, simulated time of reception.
         :param publish_time_ns: ns, simulated time of transmission.
         :param sequence: number of the message on its topic; None: the next one.
         """
         self._check_open()
-        if log_time_ns < self._min_time_ns:
-            raise BagError(f"message at {log_time_ns} ns: times of a bag start at {self._min_time_ns} ns")
-        if not 0 < channel <= len(self._channels):
+        if not 0 < channel <= len(self._topics):
             raise BagError(f"channel {channel} was never added to {self.directory}")
-        target = self._channels[channel - 1]
+        topic = self._topics[channel - 1]
         self._unsaved += 1
         if sequence is None:
-            sequence = target.count
+            sequence = topic.count
         try:
             self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
         except OSError as error:
             self._fail(error)
-        self._digest.add(target.key, log_time_ns, publish_time_ns, sequence, data, target.has_run)
-        target.count += 1
+        self._digest.add(topic.name, topic.type, log_time_ns, publish_time_ns, sequence, data)
+        topic.count += 1
         self._start_ns, self._end_ns = min(self._start_ns, log_time_ns), max(self._end_ns, log_time_ns)
-        if self._marked:
-            self._chunk_bytes += len(data) + _RECORD_BYTES
-        elif monotonic() >= self._next_flush:
-            self.flush()
+        self._chunk_bytes += len(data) + _RECORD_BYTES
+        if not self._marked:
+            self.mark()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Store a metadata record of another name than rosbag2's."""
@@ -192,7 +167,7 @@ class BagWriter:
 
     def mark(self) -> None:
         """What has been written until now is a run up to a complete step: a chunk may end here."""
-        if self._marked and (monotonic() >= self._next_flush or self._chunk_bytes > self._chunk_size):
+        if monotonic() >= self._next_flush or self._chunk_bytes > self._chunk_size:
             self.flush()
 
     def flush(self) -> None:
@@ -237,13 +212,12 @@ class BagWriter:
         topics = [
             {
                 "topic_metadata": {
-                    "name": channel.topic, "type": channel.definition.name,
-                    "serialization_format": channel.definition.message_encoding,
-                    "offered_qos_profiles": channel.profiles, "type_description_hash": channel.definition.type_hash,
+                    "name": topic.name, "type": topic.type, "serialization_format": topic.definition.message_encoding,
+                    "offered_qos_profiles": list(topic.profiles), "type_description_hash": topic.definition.type_hash,
                 },
-                "message_count": channel.count,
+                "message_count": topic.count,
             }
-            for channel in self._channels
+            for topic in self._topics
         ]  # fmt: skip
         return {
             "version": metadata.VERSION, "storage_identifier": "mcap", **extent, "topics_with_message_count": topics,
@@ -290,13 +264,11 @@ class BagDigest:
     def __init__(self) -> None:
         self._sum = 0
 
-    def add(
-        self, topic: bytes, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes, run: bool = False
-    ) -> None:
-        """Take in one message; `run`: whether its bytes carry a run's id."""
-        state = blake2b(topic, digest_size=16)
+    def add(self, topic: str, kind: str, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes) -> None:
+        """Take in one message; `kind`: its type."""
+        state = blake2b(topic.encode("utf-8", "replace"), digest_size=16)
         state.update(_TIMES.pack(log_time_ns, publish_time_ns, sequence))
-        state.update(without_run(data) if run else data)
+        state.update(without_run(data) if kind in RUN_MESSAGES else data)
         self._sum = (self._sum + int.from_bytes(state.digest(), "little")) & _MASK
 
     def hexdigest(self) -> str:

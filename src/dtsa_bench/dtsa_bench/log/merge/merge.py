@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.port import frame_in
+from dtsa_agent.air.port import flight_ns, frame_in
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.agent_bag import AgentBag
 from dtsa_bench.log.arrays import DECIDED, UNKNOWN, VECTORS, FlightArrays, ReceivedFrames, empty_arrays, split_log
@@ -39,6 +39,9 @@ class SentDatagram(NamedTuple):
     data: bytes
 
 
+SentDatagrams = Mapping[tuple[int, int], Sequence[SentDatagram]]  # by slot and sender: of all processes of the agent
+
+
 class Merge:
     """Bags of one flight on one time line.
 
@@ -51,7 +54,7 @@ class Merge:
         self.config = bags[0].swarm
         self.sent = _sent_datagrams(self.processes)
         self.heard_count, self.unmatched, crossings = _crossings(self.processes, self.sent, not self.nothing_written)
-        self.line = fit(sorted(self.processes), crossings, bags[0].flight_ns)
+        self.line = fit(sorted(self.processes), crossings, flight_ns(self.config, bags[0].port))
         self.apart = _groups_apart(self.processes, self.line)
         self._starts = _SlotStarts(self.processes, self.line.clocks, self.config.slot_ns)
 
@@ -79,7 +82,6 @@ class Merge:
             "frames_heard_not_as_sent": self.unmatched,
             "residual_us": {name: value or 0.0 for name, value in summary["residual_us"].items()},
             "clocks": summary["clocks"],
-            "slot_on_the_first_clock_ns": slot_ns,
             "agents_that_gave_up_a_time": sorted({agent for agent, number in self.processes if number < 0}),
         }
         on_line = {process: self.processes[process] for process in clocks if len(self.processes[process].log)}
@@ -102,24 +104,22 @@ class Merge:
             "not_determined": self.apart,
         }
 
-    def summary(self, air_ns: int = 0) -> dict[str, Any]:
-        """What came of the flight, and whether all decisions follow from what each agent heard, as plain values.
-
-        :param air_ns: ns that a frame is on the air, to tell which overlapped there; 0: only turns are compared.
-        """
-        processes, line = self.processes, self.line
-        has_common = self._starts.common_slot is not None
-        joined = MergedReplay(self.log).run() if has_common else None
+    def summary(self) -> dict[str, Any]:
+        """What came of the flight, and whether all decisions follow from what each agent heard, as plain values."""
+        processes, line, common = self.processes, self.line, self._starts.common_slot
+        joined = None if common is None else MergedReplay(self.log).run()
         alone = [
             MergedReplay(_log_alone(process, bag)).run()  # slots of its own, which are nobody else's
             for process, bag in processes.items()
-            if len(bag.log) and not (has_common and process in line.clocks)
+            if len(bag.log) and (common is None or process not in line.clocks)
         ]
         replays = [*([joined] if joined else []), *alone]
         refused: Counter[str] = sum((bag.refused for bag in processes.values()), Counter())
         lengths, here = [len(bag.slots) for bag in processes.values()], {agent for agent, _ in processes}
         heard = sum(len(bag.heard.row) for bag in processes.values())
         delivery = counts_of_datagrams(len(here), max(lengths), len(self.sent), heard, refused)
+        double = [slot for slot, count in Counter(slot for slot, _ in self.sent).items() if count > 1]
+        after = sum(common is not None and slot >= common for slot in double)
         held = {process_name(process): bag.summary.get("held_slots") for process, bag in processes.items()}
         rules = check_rules(self.log, joined.unsent) if joined else RuleChecker(self.config)
         return {
@@ -128,7 +128,9 @@ class Merge:
             **self._about_bags(),
             "time_line": line.summary(),
             **self._starts.summary(),
-            **self._air(air_ns),
+            "frames_sent": len(self.sent),
+            "slots_with_two_senders": after,
+            "slots_with_two_senders_before": len(double) - after,
             "frames_unsent": sum(len(replay.unsent) for replay in replays),
             "unheard": delivery.problem(refused) or None,
             "frames_heard": self.heard_count,
@@ -143,19 +145,6 @@ class Merge:
             "held_slots": {name: count for name, count in held.items() if count},
             "never_flew": [process_name(p) for p, bag in processes.items() if bag.summary.get("never_flew")],
             "flight": joined.results if joined else None,
-        }
-
-    def _air(self, air_ns: int) -> dict[str, Any]:
-        """Two senders in a slot, and frames that were on the air together."""
-        double = [slot for slot, count in Counter(slot for slot, _ in self.sent).items() if count > 1]
-        common, clocks = self._starts.common_slot, self.line.clocks
-        after = sum(common is not None and slot >= common for slot in double)
-        at = [clocks[one.process].common_ns(one.sent_ns) for one in self.sent.values() if one.process in clocks]
-        return {
-            "frames_sent": len(self.sent),
-            "slots_with_two_senders": after,
-            "slots_with_two_senders_before": len(double) - after,
-            "overlapping_frames": int((np.diff(np.sort(at)) < air_ns).sum()) if air_ns else None,
         }
 
 
@@ -213,25 +202,22 @@ def _groups_apart(processes: Processes, line: TimeLine) -> list[list[str]]:
     return [[process_name(process) for process in group] for group in groups] if len(groups) > 1 else []
 
 
-def _sent_datagrams(processes: Processes) -> dict[tuple[int, int], SentDatagram]:
-    """All datagrams that were sent, by slot and sender."""
-    sent = {}
-    for process, bag in sorted(processes.items()):
-        rows, _, datagrams, *_ = bag.log.sent_frames
-        for row, sent_ns, data in zip(rows.tolist(), bag.sent_ns.tolist(), datagrams, strict=True):
-            sent[bag.log.first_slot + row, process[0]] = SentDatagram(process, sent_ns, data)
+def _sent_datagrams(processes: Processes) -> SentDatagrams:
+    """All datagrams that were sent."""
+    sent: dict[tuple[int, int], list[SentDatagram]] = {}
+    for process, bag in processes.items():
+        frames = bag.log.sent_frames
+        for row, sent_ns, data in zip(frames.row.tolist(), bag.sent_ns.tolist(), frames.data, strict=True):
+            sent.setdefault((bag.log.first_slot + row, process[0]), []).append(SentDatagram(process, sent_ns, data))
     return sent
 
 
-def _crossings(
-    processes: Processes, sent: Mapping[tuple[int, int], SentDatagram], complete: bool
-) -> tuple[int, int, Crossings]:
+def _crossings(processes: Processes, sent: SentDatagrams, complete: bool) -> tuple[int, int, Crossings]:
     """How many frames were heard as they were sent, how many their sender's bag does not have, and those of one time.
 
     :param complete: whether all that was sent is there.
     """
     whole = {agent for agent, _ in processes} - {agent for (agent, _), bag in processes.items() if bag.broken_off}
-    earlier = _sent_datagrams({process: bag for process, bag in processes.items() if process[1] < 0})
     numbers = {process: k for k, process in enumerate(sorted(processes))}
     count = unmatched = 0
     rows: list[tuple[int, int, int, int]] = []
@@ -239,15 +225,14 @@ def _crossings(
         heard = bag.heard
         columns = heard.slot.tolist(), heard.sender.tolist(), heard.time_ns.tolist(), heard.data
         for slot, sender, arrival_ns, data in zip(*columns, strict=True):
-            origin = sent.get((slot, sender))
-            if origin is None or origin.data != data:
-                origin = earlier.get((slot, sender), origin)
-            if origin is not None and origin.data == data:
-                count += 1
-                if origin.process[1] >= 0 and receiver[1] >= 0:
-                    rows.append((numbers[origin.process], numbers[receiver], origin.sent_ns, arrival_ns))
-            elif origin is not None or (complete and sender in whole):
-                unmatched += 1
+            sent_then = sent.get((slot, sender), ())
+            origin = next((datagram for datagram in sent_then if datagram.data == data), None)
+            if origin is None:
+                unmatched += bool(sent_then) or (complete and sender in whole)
+                continue
+            count += 1
+            if origin.process[1] >= 0 and receiver[1] >= 0:
+                rows.append((numbers[origin.process], numbers[receiver], origin.sent_ns, arrival_ns))
     return count, unmatched, Crossings(*np.array(rows, np.int64).reshape(-1, 4).T)
 
 
@@ -257,7 +242,7 @@ class _SlotStarts:
     def __init__(self, processes: Processes, clocks: Mapping[Process, Clock], slot_ns: int) -> None:
         self._slot_ns = slot_ns
         on_line = [(process, clocks[process], bag) for process, bag in processes.items() if process in clocks]
-        starts = [(bag.slots, clock.common_ns(bag.start_ns)) for _, clock, bag in on_line]
+        starts = [(bag.slots, clock.common_ns(bag.log.start_ns[bag.log.recorded])) for _, clock, bag in on_line]
         first = [int(clock.common_ns(bag.started_ns)) for process, clock, bag in on_line if process[1] == 0]
         self._started_ns = max(first, default=None)
         self._slot = np.unique(np.concatenate([np.zeros(0, np.int64), *(slots for slots, _ in starts)]))
@@ -308,13 +293,13 @@ def _log_alone(process: Process, bag: AgentBag) -> FlightLog:
 
 
 def _join(
-    processes: Processes, times: Mapping[Process, ToCommon], common_slot: int, flight_ns: int,
+    processes: Processes, times: Mapping[Process, ToCommon], common_slot: int, under_way_ns: int,
     about: Mapping[str, Any],
 ) -> FlightLog:  # fmt: skip
     """The log of a flight of which these are the agents' records.
 
     :param common_slot: the first slot that all counted alike, slot 0 of the log.
-    :param flight_ns: from the order to send a frame to its arrival.
+    :param under_way_ns: from the order to send a frame to its arrival.
     :param about: what to know of the bags, as plain values.
     :raises BagError: if most slots are missing.
     """
@@ -348,7 +333,7 @@ def _join(
     columns = taken.slot.tolist(), taken.sender.tolist(), taken.time_ns.tolist(), taken.data
     for slot, sender, arrival_ns, data in zip(*columns, strict=True):  # frames of agents of which there is no record
         if first <= slot <= last:
-            frames.setdefault((slot - first, sender), (arrival_ns - flight_ns, data))
+            frames.setdefault((slot - first, sender), (arrival_ns - under_way_ns, data))
     keys = sorted(frames)
     for row, sender in keys:
         at_ns, data = frames[row, sender]

@@ -17,7 +17,7 @@ from dtsa_bench.log.bag.writer import BROKEN_OFF
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merged_flight import check_rules
 from dtsa_bench.log.record import AGENT, SLOT_RECORD, SNIFFER, build_log, check_format
-from dtsa_bench.runs.config import LOCKSTEP, REALTIME
+from dtsa_bench.runs.config import LOCKSTEP
 from dtsa_bench.runs.delivery import recorded_problem
 
 from .contents import EVENTS, MERGED, BagContents
@@ -81,11 +81,8 @@ def _verify(bag: Bag, result: Result, progress: Callable[[int], None] | None) ->
     if mode == AGENT:
         _verify_agents([bag.path], result)
         return
-    # Missions say what they fly with instead of a mode of runs.
-    settings = bag.config if mode in (LOCKSTEP, MERGED) else {**bag.config, "mode": REALTIME}
-    contents = BagContents(bag, recorded_config(settings).swarm, result)
+    contents = BagContents(bag, recorded_config(bag.config).swarm, result)
     log = build_log(bag, contents.records)
-    log.settings = settings
     if mode == MERGED:
         check_merged(log, result)
     elif mode == LOCKSTEP:

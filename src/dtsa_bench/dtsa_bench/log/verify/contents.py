@@ -8,7 +8,7 @@ from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import RUN_MESSAGES, ns_of
+from dtsa_agent.ros.common.cdr import ns_of
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.cdr import OdometryPacker
 from dtsa_bench.log.bag.errors import UnusableBag
@@ -40,11 +40,8 @@ class BagContents:
         self._run = _number(bag, RUN_ID, 16) if RUN_ID in bag.custom_data else None
         self._whole_ns = _number(bag, BROKEN_OFF) if result.broken_off else 1 << 63  # up to which nothing is lost
         self._digest, sequences = BagDigest(), dict.fromkeys(bag.topics, 0)
-        topics = {name: (name.encode(), topic.type in RUN_MESSAGES) for name, topic in bag.topics.items()}
         for message in bag.messages():
-            encoded, has_run = topics[message.topic]
-            times = message.log_time_ns, message.publish_time_ns
-            self._digest.add(encoded, *times, message.sequence, message.data, has_run)
+            self._digest.add(*message)
             expected, slot = (
                 sequences[message.topic],
                 max(0, (message.log_time_ns - names.TIME_ZERO_NS) // swarm.slot_ns),

@@ -20,18 +20,16 @@ from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.flight_log import log_of_flight
 from dtsa_bench.log.merge.merge import clocks_apart, receptions_of
 from dtsa_bench.log.merged_flight import MergedReplay, check_rules
-from dtsa_bench.log.replay import AgentReplay
+from dtsa_bench.log.replay import AgentReplay, DecisionDifference
 from dtsa_bench.log.rules import RuleChecker
-from dtsa_bench.runs.config import REALTIME
 from dtsa_bench.runs.delivery import DeliveryCounts
-from dtsa_bench.runs.metrics import FlightMetrics, may_share
+from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 from .contents import BagContents, recorded_summary
-from .differences import WHY, decision_difference, first_difference, frame_difference
 from .on_air import FramesOnAir
-from .result import Mismatch, Result
+from .result import WHY, Mismatch, Result, field_mismatch, first_difference
 
 _NOT_COMPARED = ("wall_time_s", "realtime_factor", "unusable_messages", "not_taken_in")
 _SLOT_MASK = 0xFFFFFFFF  # slots have 32 bits in frames
@@ -46,13 +44,12 @@ def check_lockstep(
     :raises Mismatch: at the first difference.
     :raises ConfigError: for a policy without slots.
     """
-    run, changes = log.config, contents.changes
+    run = log.config
     check_slotted(run.swarm.policy)
     if not len(log):
         raise UnusableBag(str(log.file), "it holds no whole slot")
-    flight = simulate(
-        run, shared_table=False, log=True, frames=True, slots=len(log), changes=changes, progress=progress
-    )
+    changes, slots = contents.changes, len(log)
+    flight = simulate(run, shared_table=False, log=True, frames=True, slots=slots, changes=changes, progress=progress)
     expected = log_of_flight(flight)
     mismatch = _first_mismatch(log, expected)
     slots = len(log) if mismatch is None else mismatch.difference.slot or 0
@@ -66,7 +63,15 @@ def check_lockstep(
     _check_summary(log, result, flight.metrics)
     delivered = int(log.received.sum())
     result.unheard = DeliveryCounts(log.agents, slots, int(log.sent.sum()), delivered, delivered).problem()
-    _check_safety(expected, result, flight.metrics, lossless=may_share(run) and not changes)
+    closest_m, closest_pair = flight.metrics.closest()
+    result.safety = {
+        "slots_with_two_senders": int((log.sent.sum(axis=1) > 1).sum()),
+        "all_agents_chose_alike": bool((log.chosen == log.chosen[:, :1]).all()),
+        "closest_pair_m": closest_m,
+        "closest_pair": list(closest_pair),
+        "crashed": flight.metrics.crash_slot >= 0,
+    }
+    _check_rules(log, result, np.zeros_like(log.sent))
 
 
 def _first_mismatch(log: FlightArrays, expected: FlightArrays) -> Mismatch | None:
@@ -74,11 +79,12 @@ def _first_mismatch(log: FlightArrays, expected: FlightArrays) -> Mismatch | Non
     for row, column in np.argwhere(~log.known)[:1].tolist():
         return Mismatch("agent", "an account", "none", "every agent answers every slot once", row, column + 1)
     mismatch = first_difference(log, {name: getattr(expected, name) for name in WHY if name != "frame"})
-    differs = (row for row in range(len(log)) if expected.frames_in(row) != log.frames_in(row))
-    row = next(differs, None) if expected.data != log.data else None
-    if row is None or (mismatch is not None and (mismatch.difference.slot or 0) <= row):
-        return mismatch
-    return frame_difference(expected.frames_in(row), log.frames_in(row), row, log)
+    until = len(log) if mismatch is None else mismatch.difference.slot or 0  # up to there as many bytes have been sent
+    for row, column in np.argwhere(log.length[:until]).tolist() if expected.data != log.data else ():
+        frames = expected.frame(row, column + 1), log.frame(row, column + 1)
+        if frames[0] != frames[1]:
+            return field_mismatch("frame", *frames, WHY["frame"], row, column + 1, log)
+    return mismatch
 
 
 def _check_summary(log: FlightArrays, result: Result, metrics: FlightMetrics) -> None:
@@ -89,22 +95,6 @@ def _check_summary(log: FlightArrays, result: Result, metrics: FlightMetrics) ->
         if recorded[key] != value:
             raise Mismatch(f"summary.json: {key}", value, recorded[key], "computed from the recorded flight")
         result.count("summary.json")
-
-
-def _check_safety(log: FlightArrays, result: Result, metrics: FlightMetrics, lossless: bool) -> None:
-    closest_m, closest_pair = metrics.closest()
-    crowded, agreement = int((log.sent.sum(axis=1) > 1).sum()), bool((log.chosen == log.chosen[:, :1]).all())
-    result.safety = {
-        "slots_with_two_senders": crowded,
-        "all_agents_chose_alike": agreement,
-        "closest_pair_m": closest_m,
-        "closest_pair": list(closest_pair),
-        "crashed": metrics.crash_slot >= 0,
-    }
-    _check_rules(log, result, np.zeros_like(log.sent))
-    if lossless and (crowded or not agreement):
-        why = "without loss all agents hear the same and choose the same"
-        raise Mismatch("two senders in one slot", "never", f"{crowded} slots", why)
 
 
 def _check_rules(log: FlightArrays, result: Result, unsent: NDArray[np.bool_]) -> None:
@@ -123,8 +113,9 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
 
     :raises Mismatch: at the first difference.
     """
-    run, own_clocks = log.config, result.mode == REALTIME
-    frames, authenticator = FramesOnAir.of_log(log, run.air, own_clocks), None
+    run, sent, authenticator = log.config, log.sent_frames, None
+    assert log.sent_ns is not None
+    frames = FramesOnAir(run.air, sent, sent.row * log.slot_ns + log.sent_ns[sent.row, sent.sender - 1])
     if run.swarm.auth:
         if key := os.environ.get(VARIABLE, ""):
             authenticator = Authenticator.from_hex(key, run.swarm.auth_session)
@@ -141,7 +132,7 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
         raise Mismatch("summary.json: slots", len(log), total, "each has a record")
     if summary:
         result.count("summary.json")
-    if own_clocks and (run.air.range_m or run.air.capture_db):
+    if run.air.range_m or run.air.capture_db:
         result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
         frames.check_numbers()
         frames.find_times()
@@ -156,17 +147,10 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
         counts["collided"][frames.slot, frames.sender - 1] = collided
         _compare(log, "overlap on the time line, and the channel's draw from its seed", received=received, **counts)
         result.count("verdicts made again", count)
-    if own_clocks:
-        _check_decisions(log, frames, result, summary, has_key=authenticator is not None)
-    else:
-        result.skipped["decisions and motion"] = (
-            "they depend on when each message reached each process, which the bag does not hold"
-        )
+    _check_decisions(log, frames, result, summary, has_key=authenticator is not None)
     # Frames that came too late to be sent were made all the same.
     _check_rules(log, result, log.known & (log.chosen == np.arange(1, log.agents + 1)) & ~log.sent)
     result.safety |= {"frames": len(frames.slot), "frames_collided": int((log.collided > 0).sum())}
-    if own_clocks:
-        result.safety |= _clock_spread(log)
 
 
 def _check_decisions(
@@ -186,19 +170,9 @@ def _check_decisions(
         for row in np.flatnonzero(np.logical_and.accumulate(log.known.all(axis=1))).tolist():
             replay.step(row)  # up to the first slot that an agent has not told of
             if replay.differences:
-                why = "follows from what the agent says to have taken in"
-                raise decision_difference(replay.differences[0], log, why)
+                raise _decision_mismatch(replay.differences[0], log)
         result.count("decisions made again", replay.equal)
     result.safety |= delays | {"stalls": summary.get("stalls", [])}
-
-
-def _clock_spread(log: FlightArrays) -> dict[str, float]:
-    on_time = log.known & ~log.sent  # a frame may leave late; the slot starts when it starts
-    rows = np.flatnonzero(on_time.sum(axis=1) > 1)
-    latest = np.where(on_time, log.offset_ns, np.iinfo(np.int64).min).max(axis=1)[rows]
-    spread = latest - np.where(on_time, log.offset_ns, np.iinfo(np.int64).max).min(axis=1)[rows]
-    mean, most = (float(spread.mean()), int(spread.max())) if len(rows) else (0.0, 0)
-    return {"clock_spread_max_ms": most / 1e6, "clock_spread_mean_ms": mean / 1e6}
 
 
 def check_own_states(log: FlightArrays, result: Result, authenticator: Authenticator | None = None) -> None:
@@ -268,7 +242,7 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     check_own_states(log, result)
     replay = MergedReplay(log).run()
     if first := next((one for process in replay.processes for one in process.replay.differences), None):
-        raise decision_difference(first, log, "follows from what the agent says to have heard")
+        raise _decision_mismatch(first, log)
     result.count("decisions made again", replay.equal)
     if others := about["frames_heard_not_as_sent"] + replay.count_unmatched_frames():
         why = "no agent hears a frame that was not sent"
@@ -293,6 +267,11 @@ def check_merged(log: FlightArrays, result: Result) -> None:
         "missing": about["missing"],
         "broken_off_bags": about["broken_off"],
     }
+
+
+def _decision_mismatch(found: DecisionDifference, log: FlightArrays) -> Mismatch:
+    why = "follows from what the agent says to have taken in"
+    return field_mismatch(found.field, found.expected, found.recorded, why, found.slot, found.agent, log)
 
 
 def _compare(log: FlightArrays, why: str = "", **expected: Any) -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_bench.log.arrays import FlightArrays, ReceivedFrames
+from dtsa_bench.log.arrays import ReceivedFrames, SentFrames
 from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
 
 from .result import Mismatch
@@ -39,36 +37,23 @@ class _RecordedMedium:
         return Reception(self._next[frame.sender].popleft(), 0, 0)
 
 
-@dataclass(slots=True)
 class FramesOnAir:
-    """The frames of a flight, in order of slot and sender (F), and what became of them."""
+    """The frames of a flight whose agents have clocks of their own (F), and what became of them.
 
-    config: ChannelConfig
-    slot: Ints  # (F,) as the senders count
-    sender: Ints  # (F,) ids
-    length: Ints  # (F,) bytes
-    received: Mask  # (F, N)
-    lost: Ints  # (F,) receivers
-    collided: Ints  # (F,) receivers
-    asked_ns: Ints  # (F,) for when each sender handed its frame to its radio
-    own_clocks: bool = True  # frames start when their sender's clock says so; otherwise with their slot
-    positions: NDArray[np.float64] | None = None  # (S, 3, N) m, at the start of each slot
-    # Without other frames; with those that a radio has to hand over before, from `resolve_again` or `find_times` on.
-    end_ns: Ints = field(init=False)  # (F,) of the transmission
-    arrival_ns: Ints = field(init=False)  # (F,) when the last of the receivers had it
+    :param frames: in order of slot and sender; slots are those that the senders count.
+    :param asked_ns: (F,) for when each sender handed its frame to its radio.
+    """
 
-    def __post_init__(self) -> None:
-        airtime, lengths = self.config.airtime, self.length.tolist()
-        self.end_ns = self.asked_ns + np.array([airtime.total_ns(length) for length in lengths], np.int64)
+    def __init__(self, config: ChannelConfig, frames: SentFrames, asked_ns: Ints) -> None:
+        self.config, self.asked_ns = config, asked_ns
+        self.slot, self.sender, data, self.received, self.lost, self.collided = frames
+        lengths, airtime = [len(frame) for frame in data], config.airtime
+        self._length = np.array(lengths, np.int64)
+        # Without other frames; `resolve_again` and `find_times` add those that a radio has to hand over before.
+        #: (F,) of the transmission.
+        self.end_ns = asked_ns + np.array([airtime.total_ns(length) for length in lengths], np.int64)
+        #: (F,) when the last of the receivers had it.
         self.arrival_ns = self.end_ns + np.array([airtime.from_radio_ns(length) for length in lengths], np.int64)
-
-    @classmethod
-    def of_log(cls, log: FlightArrays, config: ChannelConfig, own_clocks: bool) -> FramesOnAir:
-        """The frames of a log."""
-        row, sender, data, received, lost, collided = log.sent_frames
-        asked_ns = row * log.slot_ns + (0 if log.sent_ns is None else log.sent_ns[row, sender - 1])
-        length = np.array([len(frame) for frame in data], np.int64)
-        return cls(config, row, sender, length, received, lost, collided, asked_ns, own_clocks, log.track[:, -1])
 
     def resolve_again(
         self, changes: Mapping[int, dict[str, Any]], until_ns: int = 1 << 62
@@ -83,27 +68,17 @@ class FramesOnAir:
         for slot, values in changes.items():
             channel.set(slot=slot, **values)
         received, lost, collided = self.received.copy(), self.lost.copy(), self.collided.copy()
-        if self.own_clocks:
-            for v in self._on_one_line(channel):
-                if v.end_ns <= until_ns:
-                    k = v.frame_id
-                    received[k], lost[k], collided[k], count = v.received, v.lost, v.collided, count + 1
-            return received, lost, collided, count
-        edges = np.flatnonzero(np.diff(self.slot, prepend=-1, append=-1)).tolist()
-        for at in (slice(*edge) for edge in pairwise(edges)):  # the frames of a slot
-            slot = int(self.slot[at.start])
-            positions = None if self.positions is None else self.positions[slot]
-            verdict = channel.arbitrate(slot, self.sender[at].tolist(), self.length[at].tolist(), positions)
-            if (self.end_ns[at] <= until_ns).all():
-                received[at], lost[at] = verdict.mask(self.config.agents), verdict.lost or 0
-                collided[at], count = verdict.collided or 0, count + at.stop - at.start
+        for v in self._on_one_line(channel):
+            if v.end_ns <= until_ns:
+                k = v.frame_id
+                received[k], lost[k], collided[k], count = v.received, v.lost, v.collided, count + 1
         return received, lost, collided, count
 
     def _on_one_line(self, media: Any) -> Iterator[FrameVerdict[int]]:
         """The verdicts on all frames on one time line; they say when each frame has left and arrived."""
         air = Air[int](media)
         for k in np.argsort(self.asked_ns, kind="stable").tolist():
-            air.begin(k, int(self.sender[k]), int(self.asked_ns[k]), int(self.length[k]))
+            air.begin(k, int(self.sender[k]), int(self.asked_ns[k]), int(self._length[k]))
         while air.pending:
             for verdict in air.resolve(air.due_ns):
                 k = verdict.frame_id
@@ -136,7 +111,7 @@ class FramesOnAir:
 
         :raises Mismatch: at the first frame for which that is not so.
         """
-        on_air_ns = np.array([self.config.airtime.on_air_ns(length) for length in self.length.tolist()], np.int64)
+        on_air_ns = np.array([self.config.airtime.on_air_ns(length) for length in self._length.tolist()], np.int64)
         for agent in range(1, self.config.agents + 1):
             own = self.sender == agent
             # It is deaf from the order to send on.

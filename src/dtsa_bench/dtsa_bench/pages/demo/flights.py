@@ -26,7 +26,7 @@ from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.merged_bag import open_log
 from dtsa_bench.runs.config import REALTIME, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig
-from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+from dtsa_channel_sim.ros.observer import ChannelObserver
 
 AGENTS, LOSS = 12, 0.1
 LIVE_AGENTS, LIVE_SLOT_MS = 4, 6.0  # few processes and short slots: what is shown takes 1040 slots
@@ -147,7 +147,7 @@ class KillAgent(ChannelObserver):
     def start_known(self, at_s: float) -> None:
         self._begin_s = at_s
 
-    def idle(self, status: ChannelStatus) -> None:
+    def idle(self, slot: int, awaited: list[int]) -> None:
         if self._killed_s or not self._begin_s or time.monotonic() < self._begin_s + KILL_AFTER_S:
             return
         assert self._children is not None

@@ -200,7 +200,7 @@ def _ages(ages: MeanAges | None, run: FlightLog) -> dict[str, Any] | None:
             "top": round(top, digits),
         }
 
-    time_s = run.time_s(run.slot + 1)
+    time_s = run.time_s(np.arange(1, len(run) + 1))
     return {"time": thin(reduce_bins(time_s, np.mean)), "age": chart(ages.age, 2), "error": chart(ages.error, 4)}
 
 

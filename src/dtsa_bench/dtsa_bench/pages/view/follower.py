@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import make_scenario
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import ns_of, split_frames, unpack_received
+from dtsa_agent.ros.common.cdr import split_frames, unpack_received
 from dtsa_bench.log.arrays import recorded_config
 from dtsa_bench.log.replay import TableReplay
 from dtsa_bench.runs.config import RunConfig
@@ -24,7 +23,6 @@ from .history import MAX_BELIEVERS, PROCESS_COMMANDS, MomentBuilder, RunHistory
 
 _MAX_CRASH_AGENTS = 100  # in larger swarms no crashes are detected
 _FARTHEST_M = 1e6
-_SLOTS = 64  # whose frames wait for the channel's verdict
 
 
 class Follower:
@@ -59,13 +57,11 @@ class Follower:
             with suppress(DtsaError):  # frames with a key that is not here, or a policy that is not installed
                 self._replay = TableReplay(run, self.scenario, everyone=True)
         self._delivery_fault = OncePerFault(run.swarm.slot_ns)
-        self._slot_ns = run.swarm.slot_ns
         self._builder = MomentBuilder(self._history, run, self.scenario, self._more)
         self._position = np.array(self.scenario.start)  # (3, N) m
         self._chosen = np.zeros(self.agents, np.uint16)
         self._digest = np.zeros(self.agents, np.uint32)
         self._reason = np.zeros(self.agents, np.uint8)
-        self._frames: dict[int, dict[int, bytes]] = {}  # by slot and sender, until the slot's verdict is there
         self._slot = 0  # the slot that is under way
         self._next = 0  # first slot of the next moment
         self._crashed: set[tuple[int, int]] = set()
@@ -73,7 +69,7 @@ class Follower:
         self._pairs = np.triu_indices(self.agents, 1)
 
     def receive(self, kind: str, message: Any) -> None:
-        """Receive a message; `kind` is its type without the package, as ``Reception``."""
+        """Receive a message; `kind` is its type without the package, as ``SlotRecord``."""
         try:
             if kind == "Configuration":
                 settings = json.loads(message.settings)
@@ -90,57 +86,36 @@ class Follower:
             raise ValueError("an id that is none of the swarm's")
         return index
 
-    def _receive_slot(self, message: Any) -> None:
-        """The frames of a slot that at least one agent received, as the channel delivers them."""
-        if message.phase or not len(message.sender):  # Slot.RUN is 0
-            return
-        frames = split_frames(bytes(np.asarray(message.data, np.uint8)), np.asarray(message.length).tolist())
-        self._index(message.sender)
-        kept = self._frames.setdefault(int(message.heard_slot), {})
-        kept.update(zip(np.asarray(message.sender).tolist(), frames, strict=False))
-        while len(self._frames) > _SLOTS:
-            del self._frames[min(self._frames)]
-
-    def _receive_decision(self, message: Any) -> None:
-        index = self._index(message.agent)
-        self._chosen[index] = np.asarray(message.chosen, np.uint16)
-        self._digest[index] = np.asarray(message.digest, np.uint32)
-        self._reason[index] = np.asarray(message.reason, np.uint8)
-
     def note(self, text: str) -> None:
         """Add an event of now."""
         if self._run is not None:
             self._builder.add_event(self._slot, "note", text)
 
-    def _receive_markers(self, message: Any) -> None:
-        """Where all agents are at the start of a slot: the spheres, which come first."""
-        spheres = message.markers[: self.agents]
-        points = [sphere.pose.position for sphere in spheres]
-        position = np.array([(point.x, point.y, point.z) for point in points]).reshape(-1, 3)
-        if not np.abs(position).max(initial=0.0) < _FARTHEST_M:
-            raise ValueError("positions that are no numbers, or far away")
-        self._position[:, self._index([sphere.id for sphere in spheres])] = position.T
-        slot = (ns_of(spheres[0].header.stamp) - names.TIME_ZERO_NS) // self._slot_ns
-        self._builder.add_positions(slot, self._position)
-        self._detect_crashes(slot)
-
-    def _receive_reception(self, message: Any) -> None:
-        """What became of a slot: the slot is complete, and its frames go into the tables."""
-        slot, senders = int(message.slot), np.asarray(message.sender).tolist()
+    def _receive_record(self, record: Any) -> None:
+        """One slot: where agents are at its start, what they decide, its frames, and which agents received them."""
+        slot, index, senders = int(record.slot), self._index(record.agent), np.asarray(record.sender).tolist()
         self._index(senders)
-        mask = unpack_received(bytes(np.asarray(message.received, np.uint8)), len(senders), self.agents)
+        mask = unpack_received(bytes(np.asarray(record.received, np.uint8)), len(senders), self.agents)
+        frames = split_frames(bytes(np.asarray(record.data, np.uint8)), np.asarray(record.length).tolist())
+        received = [(slot, frame, row) for frame, row in zip(frames, mask, strict=True) if row.any()]
+        position = self._position.copy()  # of agents that are lost: the last one
+        position[:, index] = np.reshape(record.track, (record.steps, 3, len(index)))[-1]
+        if not np.abs(position).max() < _FARTHEST_M:
+            raise ValueError("positions that are no numbers, or far away")
+        self._position = position
+        self._chosen[:], self._reason[:] = 0, 0
+        self._chosen[index] = np.asarray(record.chosen, np.uint16)
+        self._digest[index] = np.asarray(record.digest, np.uint32)
+        self._reason[index] = np.asarray(record.reason, np.uint8)
         if slot >= self._next:
             self._next = slot + self._builder.period
+            self._builder.add_positions(slot, position)
+            self._detect_crashes(slot)
             self._add_moment(slot)
-        frames = self._frames.pop(slot, {})
         if self._replay is not None:
-            # A frame that no agent received is not delivered, and none that a listener has missed.
-            known = [row for row, sender in enumerate(senders) if sender in frames or not mask[row].any()]
-            if known or not senders:
-                self._replay.delivery.add_slot(len(known), mask[known])
-            arrived = [row for row in known if mask[row].any()]
-            self._replay.step(slot, [(slot, frames[senders[row]], mask[row]) for row in arrived])
-        self._builder.add_frames(slot, int(message.outcome), senders, self._reason, mask.astype(bool))
+            self._replay.delivery.add_slot(len(senders), mask)
+            self._replay.step(slot, received)
+        self._builder.add_frames(slot, int(record.outcome), senders, self._reason, mask.astype(bool))
         self._builder.add_choices(self._chosen)
         self._slot = slot + 1
 
@@ -194,10 +169,7 @@ class Follower:
         self._history.state = f"{state}: {self._end_reason}" if self._end_reason else state
 
     _HANDLERS: Mapping[str, Callable[[Follower, Any], None]] = {
-        "Slot": _receive_slot,
-        "Decision": _receive_decision,
-        "MarkerArray": _receive_markers,
-        "Reception": _receive_reception,
+        "SlotRecord": _receive_record,
         "RunStatus": _receive_status,
         "ParameterEvent": _receive_change,
     }

@@ -8,10 +8,11 @@ import re
 import time
 from collections import deque
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from builtin_interfaces.msg import Duration
-from dtsa_msgs.msg import Configuration, Decision, Reception, RunStatus, Slot, Status
+from dtsa_msgs.msg import Configuration, RunStatus, SlotRecord, Status
 from dtsa_msgs.srv import Land
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import SetParameters
@@ -22,7 +23,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Empty
-from visualization_msgs.msg import MarkerArray
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common import names
@@ -77,10 +77,7 @@ class GraphSource:
         self._status = self._feed(RunStatus, f"{space}/{names.STATUS}", names.latched_qos())
         waiting = _listening(_MAX_WAITING)
         self._changes = self._feed(ParameterEvent, "/parameter_events", waiting)
-        self._markers = self._feed(MarkerArray, f"{space}/{names.MARKERS}", waiting)
-        topics = ((Slot, names.SLOT), (Decision, names.DECISION), (Reception, names.RECEPTION))
-        self._slots = [self._feed(message_type, f"{space}/{topic}", waiting) for message_type, topic in topics]
-        self._pending: list[tuple[int, int, Any]] = []  # messages of the newest slot, which may not be complete
+        self._records = self._feed(SlotRecord, f"{space}/{names.SLOT_RECORD}", waiting)
         self._vehicles = VehicleWatch(self._node, self._intake, history, names.swarm_prefix(space))
         self._commands = _Commands(self._node, self._context, space) if control else None
         self._run = 0
@@ -110,7 +107,7 @@ class GraphSource:
             self._follow_runs()  # the run may have ended since the last poll
         finally:
             self._vehicles.close()
-            for feed in (self._settings, self._status, self._changes, self._markers, *self._slots):
+            for feed in (self._settings, self._status, self._changes, self._records):
                 feed.close()
             if self._commands:
                 self._commands.close()
@@ -130,7 +127,7 @@ class GraphSource:
         """Receive which run is under way, and how it is doing."""
         message = self._settings.take()
         if message is not None and message.run != self._run:
-            self._run, self._pending = message.run, []
+            self._run = message.run
             self._follower = Follower(self._history, {"live": True, "control": self._commands is not None})
             self._follower.receive("Configuration", message)
             if not self._follower.has_settings:
@@ -139,35 +136,19 @@ class GraphSource:
         status = self._status.take()
         if status is not None and self._follower is not None and status.run == self._run:
             if status.phase == _ENDED:
-                self._receive(self._follower, last=True)
+                self._receive(self._follower)
             self._follower.receive("RunStatus", status)
             if status.phase == _ENDED:
                 self._follower.finish("ended")
 
-    def _receive(self, follower: Follower, last: bool = False) -> None:
-        """Receive the messages since the last poll: of each slot decisions and frames before the outcome.
-
-        :param last: no more will come: the newest slot is complete, too.
-        """
+    def _receive(self, follower: Follower) -> None:
+        """Receive the messages since the last poll."""
         while (event := self._changes.take()) is not None:
             if event.node == f"{self._space}/channel":
                 follower.receive("ParameterEvent", event)
-        while (markers := self._markers.take()) is not None:
-            follower.receive("MarkerArray", markers)
-        for place, feed in enumerate(self._slots):
-            for _ in range(_MAX_WAITING):
-                message = feed.take()
-                if message is None:
-                    break
-                if message.run == self._run:
-                    slot = message.heard_slot if place == 0 else message.slot
-                    self._pending.append((slot, place, message))
-        self._pending.sort(key=lambda entry: entry[:2])
-        newest = self._pending[-1][0] if self._pending else 0
-        complete = [entry for entry in self._pending if last or entry[0] < newest]
-        del self._pending[: len(complete)]
-        for _, _, message in complete:
-            follower.receive(type(message).__name__, message)
+        for record in islice(iter(self._records.take, None), _MAX_WAITING):
+            if record.run == self._run:
+                follower.receive("SlotRecord", record)
 
 
 @dataclass(slots=True)

@@ -165,7 +165,7 @@ class MomentBuilder:
     ) -> None:
         """Add the frames of a slot.
 
-        :param outcome: as in dtsa_msgs/Reception.
+        :param outcome: as in dtsa_msgs/SlotRecord.
         :param reason: (N,) index into ``REASONS``: why each agent decided as it did.
         :param received: (F, N) which agents received each frame; None: all others.
         """
