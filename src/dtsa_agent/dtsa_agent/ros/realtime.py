@@ -234,20 +234,24 @@ class RealtimeNode(AgentsNode):
 
     def _prepare(self, message: Fields) -> bool:
         """Answer the channel's call, or take the start time; return False when the run is over."""
-        if message.phase == Slot.PREPARE:
-            if not all(agent.vehicle.is_ready() for agent in self.agents):
-                return True
+        if message.phase == Slot.PREPARE and self._find_vehicles():
             self._called = True
             if message.slot > names.FIRST_CALL:
                 self._go_first()
             for agent in self.agents:
-                agent.vehicle.sense(agent.swarm)
                 self._reporter.add_slot(agent.index, message.slot, agent.clock.monotonic_ns(0), 0, agent.swarm)
             self._reporter.publish(message.run, message.slot)
-        elif message.phase == Slot.START and (self._called or self._may_join()):
+        elif message.phase == Slot.START and (self._called or self._may_join()) and self._find_vehicles():
             self._go_first()
             self._begin(message.run, message.time_ns)
         return message.phase != Slot.END
+
+    def _find_vehicles(self) -> bool:
+        """Write where the vehicles are into their agents; return whether that is known of all."""
+        ready = [agent.vehicle.is_ready() for agent in self.agents]
+        for agent in self.agents:
+            agent.vehicle.sense(agent.swarm)
+        return all(ready)
 
     def _go_first(self) -> None:
         """Take real-time priority, where allowed, but not before all processes have found each other.
