@@ -43,6 +43,10 @@ class AgentVehicle:
     def sense(self, swarm: Swarm) -> None:
         """Write where the vehicle is, and how it moves, into its agent, between two slots."""
 
+    def before_slot(self, swarm: Swarm) -> Callable[[int], None] | None:
+        """Return what a station calls before each slot of the agent; None: there is nothing to sense."""
+        return None if type(self).sense is AgentVehicle.sense else lambda slot: self.sense(swarm)
+
     def fly(self, swarm: Swarm, slot: int) -> None:
         """Fly through a slot, after the agent has decided."""
         swarm.fly(slot)
@@ -88,9 +92,7 @@ class LiveAgent:
         self._signals = 0
 
     def _start(self) -> Station:
-        vehicle, every_frame = self._vehicle, bool(self.watcher or self._header is not None)
-        senses = type(vehicle).sense is not AgentVehicle.sense
-        sense = (lambda slot: vehicle.sense(self.swarm)) if senses else None
+        every_frame, sense = bool(self.watcher or self._header is not None), self._vehicle.before_slot(self.swarm)
         now = self.clock.local_ns(time.monotonic_ns())
         self._records = SlotRecords(self.watcher)
         return Station(self.swarm, self._settings, now, sense, self, every_frame)

@@ -81,9 +81,8 @@ class RealtimeAgent:
     def begin(self, settings: StationSettings, zero: int) -> None:
         """Take part from now on; ``zero``: CLOCK_MONOTONIC at the start of slot 0."""
         self.clock, self.due_ns = replace(self.clock, began_ns=zero), time.monotonic_ns()
-        senses = type(self.vehicle).sense is not AgentVehicle.sense
-        sense = (lambda slot: self.vehicle.sense(self.swarm)) if senses else None
-        self.station = Station(self.swarm, settings, self.clock.local_ns(self.due_ns), sense, self)
+        now, sense = self.clock.local_ns(self.due_ns), self.vehicle.before_slot(self.swarm)
+        self.station = Station(self.swarm, settings, now, sense, self)
 
     def receive(self, frame: bytes, arrival_ns: int) -> None:
         """A frame has arrived."""
@@ -234,20 +233,24 @@ class RealtimeNode(AgentsNode):
 
     def _prepare(self, message: Fields) -> bool:
         """Answer the channel's call, or take the start time; return False when the run is over."""
-        if message.phase == Slot.PREPARE:
-            if not all(agent.vehicle.is_ready() for agent in self.agents):
-                return True
+        if message.phase == Slot.PREPARE and self._find_vehicles():
             self._called = True
             if message.slot > names.FIRST_CALL:
                 self._go_first()
             for agent in self.agents:
-                agent.vehicle.sense(agent.swarm)
                 self._reporter.add_slot(agent.index, message.slot, agent.clock.monotonic_ns(0), 0, agent.swarm)
             self._reporter.publish(message.run, message.slot)
-        elif message.phase == Slot.START and (self._called or self._may_join()):
+        elif message.phase == Slot.START and (self._called or self._may_join()) and self._find_vehicles():
             self._go_first()
             self._begin(message.run, message.time_ns)
         return message.phase != Slot.END
+
+    def _find_vehicles(self) -> bool:
+        """Write where the vehicles are into their agents; return whether that is known of all."""
+        ready = [agent.vehicle.is_ready() for agent in self.agents]
+        for agent in self.agents:
+            agent.vehicle.sense(agent.swarm)
+        return all(ready)
 
     def _go_first(self) -> None:
         """Take real-time priority, where allowed, but not before all processes have found each other.
@@ -312,6 +315,8 @@ class RealtimeNode(AgentsNode):
                     opened.append(agent)
                     self._send(agent)
                     break
+        if not opened:
+            return
         for agent in opened:
             self.slot = max(self.slot, agent.slot)
             offset = agent.start_ns - self._zero - agent.slot * self.slot_ns
@@ -319,7 +324,7 @@ class RealtimeNode(AgentsNode):
             self._publish_odometry(agent.index, agent.swarm, 0, agent.slot)
         for agent in opened:
             agent.vehicle.fly(agent.swarm, agent.slot)
-        complete = min(agent.slot for agent in self.agents if agent.slot >= 0) if opened else -1
+        complete = min(agent.slot for agent in self.agents if agent.slot >= 0)
         if self._reporter.is_due(complete):
             self._reporter.publish(self.run_id, complete)
 

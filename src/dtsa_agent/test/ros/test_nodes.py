@@ -6,6 +6,7 @@ import signal
 import subprocess
 import time
 from array import array
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from dtsa_agent.ros.common.messages import time_of
 from dtsa_agent.ros.common.runs import Run
 
 AGENT, HOST = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host"
+CRAZYFLIE_AGENTS = "dtsa_agent.crazyflie.node.agents_node"
 
 
 class Channel:
@@ -182,8 +184,11 @@ class RealtimeChannel(Channel):
         found = [f"/swarm/{name}" for name in (names.AIR_FRAME, names.REPORT)]
         there = self.graph.node.count_publishers
         self.graph.until(lambda: self.reports and all(map(there, found)), self.publish_call)
+        self.publish_start(time.monotonic_ns() + ahead_ns)
+
+    def publish_start(self, zero_ns: int) -> None:
         message = Slot(run=self.run.number, phase=Slot.START, data=array("B", self.run.call("/test")))
-        message.header.stamp = time_of(time.monotonic_ns() + ahead_ns)
+        message.header.stamp = time_of(zero_ns)
         self.publisher.publish(message)
 
 
@@ -228,6 +233,38 @@ def test_an_agent_that_leaves_says_so_even_if_its_next_turn_is_k_m_rounds_away(t
     slots = [frame.slot for frame in channel.frames]
     assert slots[:-1] in ([], [1])  # a busy machine may keep its frame of slot 1 off the air
     assert divmod(slots[-1], config.agents) == (config.main_every - 1, 1)  # (R + T mod N) mod (K M) = 0
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("is_late", [False, True])
+def test_agents_of_vehicles_elsewhere_begin_where_odometry_has_seen_these_last(tmp_path: Path, is_late: bool) -> None:
+    """The odometry of cf1 has stopped when that of cf2 comes, which the agents wait for."""
+    with ros_graph(tmp_path) as graph:
+        channel, zero_ns = RealtimeChannel(graph), time.monotonic_ns()
+        call = (lambda: channel.publish_start(zero_ns)) if is_late else channel.publish_call
+        publishers = [graph.node.create_publisher(Odometry, f"/cf{k}/odom", 1) for k in (1, 2)]
+        graph.start(CRAZYFLIE_AGENTS, "-p", "agents:=2", "-p", "policy:=lease", "-p", "slot_ms:=20.0")
+
+        def publish(number: int) -> None:
+            message = Odometry(header=Header(frame_id="map"))
+            message.pose.pose.position.x, message.pose.pose.orientation.w = 0.5 + number, 1.0
+            publishers[number].publish(message)
+            call()
+
+        def act_for(duration_s: float, act: Callable[[], None]) -> None:
+            end_s = time.monotonic() + duration_s
+            graph.until(lambda: time.monotonic() > end_s, act)
+
+        graph.until(lambda: channel.processes and publishers[0].get_subscription_count(), call)
+        act_for(1.0, lambda: publish(0))
+        act_for(1.0, call)
+        assert not channel.reports
+        graph.until(lambda: {k for report in channel.reports for k in report.agent} == {1, 2}, lambda: publish(1))
+    begun: dict[int, list[float]] = {}
+    for report in channel.reports:
+        track = np.array(report.track).reshape(len(report.slot), report.steps, 3, len(report.agent))
+        begun = dict(zip(report.agent, track[0, -1].T.tolist(), strict=True)) | begun
+    assert begun == {1: [0.5, 0.0, 0.0], 2: [1.5, 0.0, 0.0]}
 
 
 @given(st.lists(st.binary(max_size=60), max_size=8))

@@ -91,19 +91,18 @@ def test_odometry_of_one_publisher_is_used_until_it_is_silent(tmp_path: Path) ->
         first, second = (node.create_publisher(Odometry, "/odom", 1) for node in nodes[1:])
         wait_for(lambda: first.get_subscription_count() and second.get_subscription_count())
 
-        def x_after(*publishers: tuple[Publisher, float]) -> float:
-            for publisher, x in publishers:
-                message = Odometry()
-                message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
-                publisher.publish(message)
+        def x_after(publisher: Publisher, x: float) -> float:
+            message = Odometry()
+            message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
+            publisher.publish(message)
             time.sleep(0.02)
             odometry.sense(swarm)
             return float(swarm.position[0, 0])
 
-        wait_for(lambda: x_after((first, 1.0)) == 1.0)
+        wait_for(lambda: x_after(first, 1.0) == 1.0)
         # Each in its turn, for the feed keeps the last message.
-        wait_for(lambda: x_after((first, 1.0)) == x_after((second, 1.2)) == 1.0 and intake.counts[OTHER_SENDER])
-        wait_for(lambda: x_after((second, 1.2)) == 1.2)
+        wait_for(lambda: x_after(first, 1.0) == x_after(second, 1.2) == 1.0 and intake.counts[OTHER_SENDER])
+        wait_for(lambda: x_after(second, 1.2) == 1.2)
 
 
 @pytest.mark.ros

@@ -26,7 +26,7 @@ from dtsa_agent.priority import set_realtime
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import Intake
 from dtsa_agent.ros.common.loop import Feed
-from dtsa_agent.ros.common.node_process import node_options, run_node
+from dtsa_agent.ros.common.node_process import ending, node_options, run_node
 from dtsa_agent.ros.common.parameters import check_parameters, declare_settings, swarm_wide_node
 from dtsa_agent.ros.odometry_vehicle import LATEST, VehicleOdometry, VehicleSettings, velocity_to
 from dtsa_agent.ros.realtime import RealtimeNode
@@ -146,7 +146,7 @@ class StopOrder:
 
 def _body(stop: Stop, supervised: bool) -> None:
     node, space = swarm_wide_node("crazyflie_agents", node_options(supervised))
-    try:
+    with ending(node):
         config = declare_swarm(node)
         ids = declare_ids(node, config.agents)
         station = CrazyflieAgentsSettings(**declare_settings(node, CrazyflieAgentsSettings))
@@ -164,9 +164,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         try:
             agents.run(stop)
         finally:
-            agents.loop.close()
-    finally:
-        node.destroy_node()
+            agents.close()
 
 
 def main(args: Sequence[str] | None = None) -> int:

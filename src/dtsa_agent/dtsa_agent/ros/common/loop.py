@@ -1,4 +1,4 @@
-"""The inner loop of a node that lives on one topic: waits, reads, calls back; nothing else on the way.
+"""The inner loop of a node that lives on one topic: waits and reads; nothing else on the way.
 
 rclpy's executors build their wait set anew for every message, which takes longer than a whole slot of the protocol.
 This loop keeps one wait set on one subscription. Whatever else the node has (parameter services, timers) is served by
