@@ -81,6 +81,7 @@ class Bridge:
         self.radios = DongleSet(((r.name, r.address) for r in settings.robots), log)
         self.monitor = SafetyMonitor(station.safety)
         self.heartbeat: float | None = None  # s, monotonic: the ground station's last; its silence stops the swarm
+        self._failing: dict[Callable[..., Any], str] = {}  # parts of the rules: why
         self._closing = threading.Event()
         self._guard = threading.Thread(target=self._run_rules, name="safety", daemon=True)
         self._guard.start()
@@ -167,12 +168,17 @@ class Bridge:
                 self._attempt(vehicle.tick, now)
 
     def _attempt(self, act: Callable[..., Any], *arguments: Any) -> Any:
-        """Do a part of the rules; if it fails, say so: the other rules, and those of other vehicles, go on."""
+        """Do a part of the rules; if it fails, say so once: the other rules, and those of other vehicles, go on."""
         try:
-            return act(*arguments)
+            done = act(*arguments)
         except Exception as error:
-            self._log("error", f"safety: {type(error).__name__}: {error}")
+            text = f"safety: {type(error).__name__}: {error}"
+            if self._failing.get(act) != text:
+                self._failing[act] = text
+                self._log("error", text)
             return None
+        self._failing.pop(act, None)
+        return done
 
     def _carry_out(self, required: RequiredAction, now: float) -> None:
         action, reason = required.action, required.reason
