@@ -143,7 +143,7 @@ class GraphSource:
 
     def _receive(self, follower: Follower) -> None:
         """Receive the messages since the last poll."""
-        while (event := self._changes.take()) is not None:
+        for event in islice(iter(self._changes.take, None), _MAX_WAITING):
             if event.node == f"{self._space}/channel":
                 follower.receive("ParameterEvent", event)
         for record in islice(iter(self._records.take, None), _MAX_WAITING):
