@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,18 +30,24 @@ def lossy_bag(directory: Path) -> Path:
     return bag
 
 
-def history_of(bag: Path) -> RunHistory:
-    """All of a lockstep bag, as a page gets it from the ROS graph while it is flown."""
+def history_of(bag: Path, wrong: Callable[[Any], Sequence[tuple[str, Any]]] = lambda record: ()) -> RunHistory:
+    """All of a lockstep bag, as a page gets it from the ROS graph while it is flown.
+
+    :param wrong: messages, and their kinds, that come before a slot's record and are refused.
+    """
     history = RunHistory("lossy")
-    follower = Follower(history, {})
+    follower, refused = Follower(history, {}), 0
     with Bag(bag) as opened:
         follower.start(opened.config)
         for _, record in opened.typed([SLOT_RECORD]):
             if not len(record.chosen):  # where all are at the end
                 continue
-            follower.receive("SlotRecord", record)
+            messages = wrong(record)
+            refused += len(messages)
+            for kind, message in (*messages, ("SlotRecord", record)):
+                follower.receive(kind, message)
     follower.finish("recorded")
-    assert not follower.unusable
+    assert follower.unusable == refused
     return history
 
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 import pytest
 from fly_helpers import readable
-from node_helpers import end_of, ros_graph
+from node_helpers import ServedNode, end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -232,18 +232,29 @@ def test_an_answer_to_a_call_that_comes_late_is_not_taken_for_what_was_done_in_a
 
 
 class SilentAtFirst(LateSender):
-    """Answers calls, and reports nothing of the first slots."""
+    """Answers calls, and reports nothing of the first slots. A stranger answers before it, from somewhere else."""
 
     def __init__(self, node: Node, channel: RealtimeChannel) -> None:
         super().__init__(node, channel)
         self.places: list[list[float]] = []
+        self._stranger, self._forged = ServedNode(node.context.get_domain_id(), "stranger"), 0
+        make, topic = self._stranger.node.create_publisher, f"{names.SWARM}/{names.REPORT}"
+        self._own, self._foreign = self._reports, make(Report, topic, names.lockstep_qos(16))
 
     def _report(self, slot: int, place: float = 3.0) -> None:
+        is_forged = self._forged < 3
+        if is_forged and not self._foreign.get_subscription_count():
+            return
+        self._forged += is_forged
+        self._reports = self._foreign if is_forged else self._own
         if slot >= names.FIRST_CALL or slot > 100:
-            super()._report(slot, place)
+            super()._report(slot, 9.0 if is_forged else place)
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self.places.append(answers.position.ravel().tolist())
+
+    def close(self) -> None:
+        self._stranger.close()
 
 
 @pytest.mark.ros

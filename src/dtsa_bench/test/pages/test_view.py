@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import socket
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,6 +86,21 @@ def test_ages_and_beliefs_are_those_of_the_report(bag: Path, history: RunHistory
             heard = np.frombuffer(moment.belief(observer, AGENTS)[0], "<u2")
             rows = table[(table.slot == moment.slot - 1) & (table.observer == observer)]
             assert heard[rows.agent - 1].tolist() == rows.age_slots.tolist()
+
+
+def test_messages_that_cannot_be_are_refused_and_change_nothing(bag: Path, history: RunHistory) -> None:
+    def wrong(record: Any) -> list[tuple[str, Any]]:
+        fields = {
+            "agent": record.agent + 1, "track": np.append(record.track[:-1], np.nan), "steps": record.steps + 1,
+            "sender": np.append(record.sender, 1), "data": np.append(record.data, 0),
+            "received": np.append(record.received, 0), "chosen": record.chosen[:1], "digest": record.digest[:1],
+            "reason": record.reason[:1],
+        }  # fmt: skip
+        status = {"slot": record.slot, "lost": [1], "lag_ms": math.nan, "phase": 2, "reason": ""}
+        records = [("SlotRecord", replace(record, **{name: values})) for name, values in fields.items()]
+        return [*records, ("RunStatus", SimpleNamespace(**status))]
+
+    assert history_of(bag, wrong).since(0, MAX_MOMENTS) == history.since(0, MAX_MOMENTS)
 
 
 def test_a_history_and_what_waits_for_a_page_are_limited() -> None:

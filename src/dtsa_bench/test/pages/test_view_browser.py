@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,11 @@ from browser_helpers import CHROMIUM, MISSING, browsing, colours, serving
 from view_helpers import AGENTS, PATIENCE_S, history_of, lossy_bag, numbers, on_graph, viewed_flight
 from waiting import wait_for
 
+from dtsa_agent.core import SwarmConfig
 from dtsa_bench.log.record import load_log
 from dtsa_bench.pages.view.history import MAX_MOMENTS, Moment, PageCommand, RunHistory, VehicleStates
 from dtsa_bench.pages.view.server import ViewServer
+from dtsa_bench.runs.config import RunConfig
 
 FIGURES = """(() => ({
   heads: [...document.querySelectorAll("h2")].map(node => node.textContent),
@@ -120,6 +123,29 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
         moments = listener.since(0, MAX_MOMENTS)[1]
         assert moments[-1].heard
         assert json.loads(moments[-1].text)["lag_ms"] > 0.0
+
+
+@pytest.mark.ros
+def test_a_page_that_hears_of_the_end_before_the_settings_shows_the_end(tmp_path: Path) -> None:
+    """Both are there for late subscribers, and come in any order."""
+    from dtsa_msgs.msg import Configuration, RunStatus
+    from node_helpers import ros_graph
+    from rclpy.duration import Duration
+
+    from dtsa_agent.ros.common import names
+    from dtsa_channel_sim.ros.run_topics import configuration_message
+
+    history = RunHistory("late")
+    with ros_graph(tmp_path) as graph, on_graph(history, graph.node.context.get_domain_id()):
+        make, qos = graph.node.create_publisher, names.latched_qos()
+        status = make(RunStatus, f"{names.SWARM}/{names.STATUS}", qos)
+        status.publish(RunStatus(run=7, phase=RunStatus.ENDED, reason="all are there"))
+        wait_for(status.get_subscription_count)
+        assert status.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+        time.sleep(0.2)  # it is read
+        settings = RunConfig(SwarmConfig(agents=2)).to_dict()
+        make(Configuration, f"{names.SWARM}/{names.CONFIGURATION}", qos).publish(configuration_message(settings, 7))
+        wait_for(lambda: history.state == "ended: all are there")
 
 
 @pytest.mark.ros

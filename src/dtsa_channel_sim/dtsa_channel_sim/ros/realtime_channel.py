@@ -29,7 +29,7 @@ from dtsa_channel_sim.model.air import NEVER, FrameVerdict, LiveAir
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .answers import Accounts, Answers, check_report, places_of
+from .answers import Accounts, Answers, check_report
 from .ros_channel import RosChannel
 
 _NS = 1_000_000_000
@@ -197,7 +197,7 @@ class RealtimeChannel(RosChannel):
             with suppress(Exception):  # rclpy has no common base for what a message can do to it
                 message = read_report(data)
                 if message.run == self.run_id and message.slot.tolist() == [number]:
-                    at = places_of(message.agent, self.agents)
+                    at = self.roster.check_sender(message.agent, self._reports.sender)
                     check_report(message, self._steps)
                     if not self.answers.answered[at].any():
                         self.answers.add_report(at, message, 0)

@@ -102,6 +102,8 @@ class Follower:
         position[:, index] = np.reshape(record.track, (record.steps, 3, len(index)))[-1]
         if not np.abs(position).max() < _FARTHEST_M:
             raise ValueError("positions that are no numbers, or far away")
+        if not len(record.chosen) == len(record.digest) == len(record.reason) == len(index):
+            raise ValueError("decisions of other agents")
         self._position = position
         self._chosen[:], self._reason[:] = 0, 0
         self._chosen[index] = np.asarray(record.chosen, np.uint16)
@@ -140,13 +142,16 @@ class Follower:
                 self._builder.add_crash(slot, pair, math.sqrt(gap[k]))
 
     def _receive_status(self, message: Any) -> None:
-        """Which agents have fallen silent, and whether the run is over."""
+        """Which agents have fallen silent, how late the channel is, and whether the run is over."""
         slot, lost = int(message.slot), set((self._index(message.lost) + 1).tolist())
+        lag_ms = float(message.lag_ms)
+        if not math.isfinite(lag_ms):  # no page reads that
+            raise ValueError("a lag that is no number")
         for agent in sorted(lost - self._builder.absent):
             self._builder.lose(slot, agent, f"cf{agent} has fallen silent")
         for agent in sorted(self._builder.absent - lost):
             self._builder.regain(slot, agent, f"cf{agent} takes part again")
-        self._lag_ms = float(message.lag_ms)
+        self._lag_ms = lag_ms
         if message.phase == 2 and not self._end_reason:  # RunStatus.ENDED
             self._end_reason = str(message.reason)[:300] or "over"
             self._builder.add_event(slot, "end", f"the run has ended: {self._end_reason}")

@@ -81,6 +81,7 @@ class GraphSource:
         self._vehicles = VehicleWatch(self._node, self._intake, history, names.swarm_prefix(space))
         self._commands = _Commands(self._node, self._context, space) if control else None
         self._run = 0
+        self._newest_status: RunStatus | None = None  # until it is shown: settings of its run may come later
         self._follower: Follower | None = None
         self.stopped = False
 
@@ -133,8 +134,9 @@ class GraphSource:
             if not self._follower.has_settings:
                 self._follower = None
                 return
-        status = self._status.take()
+        status = self._newest_status = self._status.take() or self._newest_status
         if status is not None and self._follower is not None and status.run == self._run:
+            self._newest_status = None
             if status.phase == _ENDED:
                 self._receive(self._follower)
             self._follower.receive("RunStatus", status)
@@ -143,7 +145,7 @@ class GraphSource:
 
     def _receive(self, follower: Follower) -> None:
         """Receive the messages since the last poll."""
-        while (event := self._changes.take()) is not None:
+        for event in islice(iter(self._changes.take, None), _MAX_WAITING):
             if event.node == f"{self._space}/channel":
                 follower.receive("ParameterEvent", event)
         for record in islice(iter(self._records.take, None), _MAX_WAITING):
