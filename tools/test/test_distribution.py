@@ -75,7 +75,7 @@ def test_what_is_in_the_wheel_and_in_the_source(wheel: Path) -> None:
     compiled = {name.rpartition("/")[2] for name in names if name.endswith(".so")}
     assert {"_kernel.abi3.so", "_endless.abi3.so"} <= compiled
     assert all(name.endswith(".abi3.so") for name in compiled)
-    assert "dtsa_bench/log/bag/messages/Slot.msg" in names
+    assert {"dtsa_bench/log/bag/messages/Slot.msg", "dtsa/__init__.pyi", "dtsa/_settings.pyi"} <= set(names)
     assert not [name for name in names if "/test/" in name or name.startswith(("test", "checkout", "dtsa_dev"))]
     with tarfile.open(next(wheel.parent.glob("*.tar.gz"))) as file:
         sources = {name.partition("/")[2] for name in file.getnames()}

@@ -114,8 +114,3 @@ def register(kind: str, name: str, factory: Any) -> None:
     if kind not in REGISTRIES:
         raise ConfigError("kind", kind, ", ".join(REGISTRIES))
     REGISTRIES[kind].register(name, factory)
-
-
-def registered() -> dict[str, set[str]]:
-    """Names that only this process knows, by kind."""
-    return {kind: registry.registered for kind, registry in REGISTRIES.items()}

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.config import REGISTRIES
 from dtsa_bench.drawing.card import as_html, as_text
 from dtsa_bench.experiments.batch import Journal, run_all
 from dtsa_bench.experiments.provenance import code_digest
 from dtsa_bench.experiments.sweep import Sweep, load_preset, make_sweep
 from dtsa_bench.experiments.tables import SweepTable, table_html, table_text, write_results
-
-from ._flights import registered
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,14 +86,10 @@ class SweepResult:
 
 def _refuse_registered(plan: Sweep, field: str, value: object) -> None:
     """Other processes do not know what was registered in this one, and no journal notices when it changes."""
-    for kind, names in registered().items():
-        for cell in plan.cells:
-            name = getattr(cell.run(plan.seeds[0]).swarm, kind)
-            if name in names:
-                allowed = f"{'1' if field == 'jobs' else 'None'} with the registered {kind} {name}"
-                raise ConfigError(
-                    field, value, f"{allowed}; or announce it by an entry point (docs/reference/plug-ins.md)"
-                )
+    for kind, name in sorted(plan.batch.plug_ins):
+        if name in REGISTRIES[kind].registered:
+            allowed = f"{'1' if field == 'jobs' else 'None'} with the registered {kind} {name}"
+            raise ConfigError(field, value, f"{allowed}; or announce it by an entry point (docs/reference/plug-ins.md)")
 
 
 def sweep(

@@ -193,7 +193,8 @@ class LiveAgent:
         if accepted and self._header is not None:
             start, late = self.station.slot_start_ns(slot), self._header.late_ns(datagram)
             self.reports.count_arrival(arrival_ns - start - self._flight_ns - late)
-        self._records.receive(ReceivedFrame(sender, slot, arrival_ns, datagram, accepted))
+        if self.watcher is not None:
+            self._records.receive(ReceivedFrame(sender, slot, arrival_ns, datagram, accepted))
 
     def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
         self.reports.count_refused(fault, time.monotonic_ns())

@@ -16,7 +16,7 @@ from dtsa_agent.core.swarm import Floats
 _SECOND = 1_000_000_000
 _ON_TIME_NS = 1_000_000
 TOO_LATE = "too late"  # an own frame that would have disturbed the next turn
-_STATUS_NS = 100_000_000  # from one look at the station's status to the next
+_STATUS_NS = 100_000_000  # from one check of the station's status to the next
 _STATE_NS = _SECOND  # a state that lasts is reported after this time, and the next one not before twice that
 _FOREIGN_NS = 30 * _SECOND  # from a line about foreign datagrams to the next
 _TIMED_FRAMES, _OFF_SHARE = 100, 0.05  # frames off their slots: of so many, so large a share means too short slots
@@ -94,8 +94,7 @@ class SlotRecords:
 
     def receive(self, frame: ReceivedFrame) -> None:
         """The agent has heard a frame."""
-        if self._watcher is not None:
-            (self._before if self._record is None else self._record.heard).append(frame)
+        (self._before if self._record is None else self._record.heard).append(frame)
 
     def close(self) -> None:
         """The present slot is over."""

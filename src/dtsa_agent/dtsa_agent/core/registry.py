@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/reference/protocol.md
 MAX_OWN_BYTES = 16  # of one plug-in
-SELECTIONS, PROFILES, REASONS = NAMES["selections"], NAMES["profiles"], NAMES["reasons"]
+SELECTIONS, REASONS = NAMES["selections"], NAMES["reasons"]
 
 # Why an agent expects another one (or none) to send in a slot, and what that means.
 REASON_TEXTS: Mapping[str, str] = MappingProxyType(

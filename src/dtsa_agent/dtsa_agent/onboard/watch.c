@@ -10,12 +10,11 @@
 
 /* Without gaps, little-endian: see onboard.py. */
 typedef struct __attribute__((packed)) opened_note {
-    uint8_t kind, anew, reason, length;
-    int64_t slot, start_ns, opened_ns;
+    uint8_t kind, anew, reason;
+    int64_t slot, start_ns;
     uint16_t present, chosen;
     uint32_t digest;
     double score, position[3], velocity[3], command[3], goal[3];
-    uint8_t frame[DTSA_FRAME_MAX];
 } opened_note;
 
 typedef struct __attribute__((packed)) heard_note {
@@ -26,15 +25,14 @@ typedef struct __attribute__((packed)) heard_note {
 
 static void opened(void *context, int64_t slot, int64_t start, int64_t now, int is_first)
 {
+    (void)now;
     const dtsa_agent *a = context;
     opened_note n = {
         .kind = 'O',
         .anew = (uint8_t)is_first,
         .reason = (uint8_t)a->decision.reason,
-        .length = a->frame_length,
         .slot = slot,
         .start_ns = start,
-        .opened_ns = now,
         .present = a->present,
         .chosen = (uint16_t)a->decision.chosen,
         .digest = a->decision.digest,
@@ -44,7 +42,6 @@ static void opened(void *context, int64_t slot, int64_t start, int64_t now, int 
     memcpy(n.velocity, a->velocity, sizeof n.velocity);
     memcpy(n.command, a->command, sizeof n.command);
     memcpy(n.goal, a->goal, sizeof n.goal);
-    memcpy(n.frame, a->frame, a->frame_length);
     peerLabRecord(&n, sizeof n);
 }
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import subprocess
 
 
 def program() -> str:
@@ -16,11 +19,13 @@ def end_process(
     process: subprocess.Popen[str] | subprocess.Popen[bytes], patience_s: float, ask: signal.Signals = signal.SIGINT
 ) -> bool:
     """Ask a process to end and kill it if it does not in time; return whether it has ended by itself."""
+    from subprocess import TimeoutExpired  # milliseconds of each command's start
+
     if process.poll() is None:
         process.send_signal(ask)
     try:
         process.wait(patience_s)
-    except subprocess.TimeoutExpired:
+    except TimeoutExpired:
         process.kill()
         process.wait()
         return False

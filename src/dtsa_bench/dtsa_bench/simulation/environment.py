@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.kernel import lib
 from dtsa_agent.core.plugins import PluginSwarm, Table
-from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS
-from dtsa_agent.core.settings.flight_models import AVOIDERS
+from dtsa_agent.core.registry import POLICIES, REASONS
 from dtsa_agent.keys import with_key
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import COMPLETED, CRASHED, FlightMetrics
@@ -171,8 +170,8 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         self._next_seed = seed + 1
         #: What no agent knows, to look at: the scenario, the swarm, the metrics of the flight under way.
         self.scenario = make_scenario(run.swarm)
-        built_in = run.swarm.estimator in ESTIMATORS.rows and run.swarm.avoider in AVOIDERS.rows
-        swarm = (Swarm if built_in else PluginSwarm)(run.swarm, self.scenario)
+        has_plug_ins = any(kind != "policy" for kind, _ in run.swarm.plug_ins)
+        swarm = (PluginSwarm if has_plug_ins else Swarm)(run.swarm, self.scenario)
         swarm.reason[:] = REASONS.index("plugin")
         self.swarm, self.metrics = with_key(swarm), FlightMetrics(run, self.scenario)
         self.slot = 0  # the one that begins

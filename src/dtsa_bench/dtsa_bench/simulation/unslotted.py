@@ -83,15 +83,15 @@ class Radio:
     def receive_frame(self, frame: bytes, slot: int) -> None:
         """Pass a frame to the agent that its policy has decoded from packets; ``slot``: that of the state in it."""
         if not isinstance(frame, bytes) or not frame:
-            raise PluginError(f"{self._policy}, wake", f"received {frame!r}; allowed: bytes of a frame")
+            raise PluginError(f"{self._policy}, wake", f"received {shown(frame)}; allowed: bytes of a frame")
         receivers = np.arange(len(self._traffic.frames)) == self._index
         self._traffic.carried.combined.append((slot, frame, receivers))
 
     def _transmit(self, packet: _Packet) -> bool:
         traffic, agents = self._traffic, len(self._traffic.frames)
         if not isinstance(packet.note, bytes) or packet.to not in range(agents + 1):
-            given = (packet.note, packet.to)
-            raise PluginError(f"{self._policy}, wake", f"sent {given!r}; allowed: bytes, to 0 (all) to {agents}")
+            given = f"{shown(packet.note)}, {shown(packet.to)}"
+            raise PluginError(f"{self._policy}, wake", f"sent ({given}); allowed: bytes, to 0 (all) to {agents}")
         if traffic.now_ns < traffic.free_ns[self._index]:
             return False
         traffic.begin(packet, traffic.now_ns + traffic.to_radio_ns(len(packet.note) + len(packet.frame)))
@@ -111,7 +111,6 @@ class UnslottedTraffic:
         self._air: Air[_Packet] = Air(channel)
         row, agents = swarm.config.policy_row, range(len(swarm.ids))
         self._reacts = row.reacts
-        self._radios = [Radio(self, index) for index in agents]
         self.free_ns, self._sent_ns = [0 for _ in agents], [0 for _ in agents]  # of radios: done, began, with the last
         # How often each radio has listened for the frame that it holds; None: they do not listen.
         self.listen_counts = [0 for _ in agents] if row.listens else None
@@ -169,7 +168,7 @@ class UnslottedTraffic:
 
     def _wake(self, index: int) -> None:
         policy = self.swarm.policies[index]
-        answer = policy.wake(self.swarm.tables[index], self.now_ns, self._radios[index])
+        answer = policy.wake(self.swarm.tables[index], self.now_ns, Radio(self, index))
         if (index, _LISTEN) not in self._due_ns:  # else it wakes when the frame has begun
             self.schedule(index, _WAKE, _next_wake(policy, answer, self.now_ns))
 

@@ -54,6 +54,8 @@ def test_every_public_name_is_there_and_importing_it_loads_nothing_heavy() -> No
     for name in dtsa.__all__:
         assert getattr(dtsa, name) is not None
     assert dir(dtsa) == sorted(dtsa.__all__)
+    stub = Path(dtsa.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+    assert sorted("".join(found) for found in re.findall(r" as (\w+)$|^(\w+) = ", stub, re.MULTILINE)) == dir(dtsa)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         dtsa.nothing  # noqa: B018
     program = f"import sys, dtsa; print([name for name in {HEAVY} if name in sys.modules])"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any
 
 import numpy as np
@@ -92,3 +93,13 @@ def test_who_hears_another_one_waits_and_hidden_or_turning_senders_collide() -> 
 def test_rules_that_cannot_be_are_named(answer: Any, text: str) -> None:
     with pytest.raises(PluginError, match=f"policy waits, {text}"):
         sends(7.0, 1 * MS, 1 * MS + TURN, answer=answer)
+
+
+@pytest.mark.parametrize("scheme", ["csma", "mixer"])
+def test_tables_of_a_flight_that_is_over_do_not_wait_for_the_garbage_collector(scheme: str) -> None:
+    swarm = make_swarm(SwarmConfig(agents=3, policy=scheme))
+    traffic = UnslottedTraffic(swarm, Channel(ChannelConfig(agents=3)))
+    traffic.slot(0)
+    kept = weakref.ref(swarm)
+    del swarm, traffic
+    assert kept() is None

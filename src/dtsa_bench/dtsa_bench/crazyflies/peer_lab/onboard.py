@@ -22,7 +22,7 @@ from .app import App, LabSettings, read_app
 from .laboratory import Laboratory
 
 APP = Path(dtsa_agent.__file__).parent / "onboard"
-_OPENED, _HEARD = struct.Struct("<4B3q2HI13d60s"), struct.Struct("<4B2q60s")  # onboard/watch.c
+_OPENED, _HEARD = struct.Struct("<3B2q2HI13d"), struct.Struct("<4B2q60s")  # onboard/watch.c
 _ORDER_S = 0.02  # from one packet of the app channel to the next
 _CLIMB_S = 3.0
 HEIGHT_M = 1.2  # of the frame map above the floor
@@ -62,7 +62,7 @@ class _AgentFlight:
             self._records.receive(ReceivedFrame(sender, slot, at_ns, frame[:length], bool(accepted)))
 
     def _open(self, data: bytes) -> None:
-        _, is_first, reason, _, slot, start, _, present, chosen, digest, score, *vectors, _ = _OPENED.unpack(data)
+        _, is_first, reason, slot, start, present, chosen, digest, score, *vectors = _OPENED.unpack(data)
         position, velocity, command, goal = np.array(vectors).reshape(4, 3)
         track = np.repeat(position[None], self._steps, axis=0)
         self._records.open(SlotRecord(
