@@ -208,18 +208,32 @@ def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespa
     assert (difference.what, difference.slot, difference.agent) == ("chosen", log.first_slot + row, 2)
 
 
+def _copied(whole: Path, target: Path, custom: dict[str, str]) -> str:
+    """A bag that says other things of itself, finished by the real writer."""
+    with Bag(whole) as bag, BagWriter(target, None, custom_data={**bag.custom_data, **custom}) as copy:
+        channels = {name: copy.add_topic(name, info.type, info.profiles) for name, info in bag.topics.items()}
+        for one in bag.messages():
+            copy.write(channels[one.topic], one.data, one.log_time_ns, one.publish_time_ns)
+    return str(target)
+
+
+def test_a_merged_bag_with_other_control_instants_than_its_settings_is_refused(flight, tmp_path, capsys):
+    with Bag(flight.whole) as bag:
+        settings = {**bag.config, "swarm": {**bag.config["swarm"], "control_ms": 20.0}}
+    lie = _copied(flight.whole, tmp_path / "lie.mcap", {"configuration": json.dumps(settings)})
+    assert main(["verify", lie]) == 1
+    assert main(["export", lie, "--to", "csv", "--out", str(tmp_path / "tables")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 @pytest.mark.parametrize("change", [
     {"agents_that_gave_up_a_time": None}, {"not_determined": [3]}, {"processes": []}, {"processes": [{"agent": 1e999}]},
     {"residual_us": None}, {"common_slot": 1 << 70},
 ])  # fmt: skip
 def test_a_merged_bag_that_lies_of_its_origin_is_found(flight, tmp_path, capsys, change):
     with Bag(flight.whole) as bag:
-        custom = {**bag.custom_data, MERGED_FROM: json.dumps(json.loads(bag.custom_data[MERGED_FROM]) | change)}
-        with BagWriter(tmp_path / "lie.mcap", None, custom_data=custom) as copy:
-            channels = {name: copy.add_topic(name, info.type, info.profiles) for name, info in bag.topics.items()}
-            for one in bag.messages():
-                copy.write(channels[one.topic], one.data, one.log_time_ns, one.publish_time_ns)
-    assert main(["verify", str(tmp_path / "lie.mcap")]) == 1
+        about = json.loads(bag.custom_data[MERGED_FROM]) | change
+    assert main(["verify", _copied(flight.whole, tmp_path / "lie.mcap", {MERGED_FROM: json.dumps(about)})]) == 1
     assert capsys.readouterr().err == ""
 
 
