@@ -138,6 +138,9 @@ def test_the_ledger_sees_broken_rules() -> None:
     assert "a second time" in judged(again).broken[0]
     opened = judged({4: {1: frame(1, 4, b"\xff" + bytes(10))}, 8: {2: frame(2, 8), 3: frame(3, 8)}})
     assert (opened.broken, opened.collisions["open"]) == ([], 1)
+    ledger = GrantLedger(4, 5, 10)
+    ledger.check_slot(20, {1: b"forged", 3: frame(3, 20)})  # an anchor, no main one
+    assert any("agent 1 sent a frame that is none" in text for text in ledger.broken)
     book = GrantLedger(3, 3)
     own = Frame(1, 3, 1, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
     book.note_frame(3, 1, encode_extended(ExtendedFrame(own, c_s=1, probation=True)))

@@ -64,7 +64,7 @@ def test_ids_are_dealt_out_at_random_unless_told_otherwise() -> None:
     assert not np.array_equal(ordered, shuffled)
     told = make_scenario(SwarmConfig(agents=12, jitter_m=0, places="12,11,10,9,8,7 6 5 4 3 2 1")).start
     assert np.array_equal(told, ordered[:, ::-1])
-    for places in ("1 2 3", "1 1 " + " ".join(map(str, range(3, 13))), "one"):
+    for places in ("1 2 3", "1 1 " + " ".join(map(str, range(3, 13))), "one", "9" * 5000):
         with pytest.raises(ConfigError, match="1 to 12, each once"):
             SwarmConfig(agents=12, places=places)
 

@@ -32,7 +32,7 @@ from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS, ReceivedFrames
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, NothingWritten, UnusableBag
 from dtsa_bench.log.bag.reader import Bag, BagMessage
-from dtsa_bench.log.bag.recover import recover
+from dtsa_bench.log.bag.recover import Recovery, recover
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest, BagWriter
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.record import (
@@ -57,6 +57,7 @@ SUMMARY = "summary"  # name in custom data
 _CHUNK = 1 << 18  # bytes
 _AT_A_TIME = 8  # slots: several at a time take half as long
 _MOST_NS = 1 << 58  # of a clock, nine years: sums and differences of times fit into 64 bits
+_MOST_OF_PORT = 10**12  # ns or bytes
 _NAME = re.compile(r"cf\d+\.mcap")
 
 
@@ -257,21 +258,27 @@ def read(path: str | Path) -> AgentBag:
 
     :raises UnusableBag: if it is no bag of an agent on a network, or its messages are not those that were recorded.
     :raises NothingWritten: if its process ended before it wrote anything.
+    :raises OSError: if the file is damaged, and there is no room for a copy of what can be read.
     """
     given = Path(path)
     if given.is_dir() and not any(given.glob("*.mcap*")):
         raise NothingWritten(given, "holds no .mcap file")
     file = metadata.find_files(given)[0]
     try:
-        if not file.stat().st_size:
-            raise NothingWritten(file, "is empty")
+        is_empty = not file.stat().st_size
+    except OSError as error:
+        raise UnusableBag(file, error.strerror or str(error)) from None
+    if is_empty:
+        raise NothingWritten(file, "is empty")
+    try:
         with ExitStack() as stack:
             try:
                 bag, damage = stack.enter_context(Bag(given)), ""
                 messages = list(bag.messages())
-            except UnusableBag:
-                saved = recover(given, Path(stack.enter_context(TemporaryDirectory())) / file.name)
-                bag, damage = stack.enter_context(Bag(saved.directory)), saved.damaged[0] if saved.has_end else ""
+            except UnusableBag as error:
+                saved = _recover(given, file, stack)
+                bag = stack.enter_context(Bag(saved.directory))
+                damage = (saved.damaged or [error.reason])[0] if saved.has_end else ""
                 messages = list(bag.messages())
             try:
                 bag.check_files()
@@ -280,8 +287,21 @@ def read(path: str | Path) -> AgentBag:
             return _read_bag(file, bag, messages, damage)
     except UnusableBag as error:
         raise type(error)(file, error.reason) from None
-    except OSError as error:
-        raise UnusableBag(file, error.strerror or str(error)) from None
+
+
+def _recover(given: Path, file: Path, stack: ExitStack) -> Recovery:
+    """What can be read of a damaged file, in a bag that is gone when the stack is closed.
+
+    :raises OSError: if there is no room for it.
+    """
+    directory = Path(stack.enter_context(TemporaryDirectory()))
+    try:
+        return recover(given, directory / file.name)
+    except BagError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+        number, why = error.__cause__.errno, f"{error.__cause__.strerror}, to copy what can be read of {file}"
+        raise OSError(number, why, str(directory.parent)) from None
 
 
 def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str) -> AgentBag:
@@ -295,12 +315,11 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
     if messages:
         check_format(bag)
     for message in messages:
-        times = message.log_time_ns, message.publish_time_ns, message.sequence
-        digest.add(message.topic, message.type, *times, message.data)
+        digest.add(*message)
     if custom.get(KEY, digest.hexdigest()) != digest.hexdigest():
         raise UnusableBag(file, "a message was changed, left out, added or moved after the recording")
     try:
-        about, summary = json.loads(custom[AGENT]), json.loads(custom.get(SUMMARY, "{}"))
+        about, summary = metadata.load_json(custom[AGENT]), metadata.load_json(custom.get(SUMMARY, "{}"))
         swarm = SwarmConfig.from_dict(bag.config["swarm"])
         agent, started_ns = int(about["id"]), int(about["started_ns"])
         # As they were recorded: the clock of a vehicle that was switched off starts anew. Up to the first that is lost.
@@ -309,11 +328,21 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
         logs = [_log_of(part, file.stem, agent, swarm, about) for part in _split_times(records)]
         refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})
         return AgentBag(
-            file, agent, swarm, PortProperties(**about["port"]), started_ns, logs[-1], logs[:-1], refused, summary,
+            file, agent, swarm, _port_of(about), started_ns, logs[-1], logs[:-1], refused, summary,
             BROKEN_OFF in custom, damage, bool(about["goals_told"]),
         )  # fmt: skip
     except (DtsaError, LookupError, ValueError, TypeError, AttributeError, OverflowError) as error:
         raise UnusableBag(file, f"what it says of its agent cannot be read ({error})") from None
+
+
+def _port_of(about: Mapping[str, Any]) -> PortProperties:
+    """The port of an agent; ValueError: a number of it is none that a port has."""
+    port = PortProperties(**about["port"])
+    for one in dataclasses.fields(port):
+        value, default = getattr(port, one.name), one.default
+        if isinstance(default, int) and (type(value) is not type(default) or not 0 <= value <= _MOST_OF_PORT):
+            raise ValueError(f"port.{one.name} {value!r}")
+    return port
 
 
 def _split_times(records: Sequence[Any]) -> list[list[Any]]:

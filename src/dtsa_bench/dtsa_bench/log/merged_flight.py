@@ -147,8 +147,10 @@ class MergedReplay:
         assert log.merged is not None
         self._log, self._whole, self._config = log, log.whole or log, log.config.swarm
         try:
+            if len(self._whole) and self._whole.track.shape[1] != self._config.steps:
+                raise ValueError(f"{self._whole.track.shape[1]} control instants a slot, not {self._config.steps}")
             self.processes = [_Process(self._whole, about, compares) for about in log.merged["processes"]]
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
             raise UnusableBag(log.file or log.name, f"its records do not fit together ({error})") from None
         self.results: dict[str, Any] | None = None  # None: there are none
         self._counted: tuple[int, int] | None = None  # first and last row of the log that they count

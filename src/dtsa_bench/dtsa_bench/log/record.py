@@ -15,7 +15,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import SECOND, ns_of, pack_received, split_frames, unpack_received
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import UnusableBag
-from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM
+from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM, load_json
 from dtsa_bench.log.bag.reader import Bag
 
 from .arrays import DECIDED, PRESENT, UNKNOWN, VECTORS, ReceivedFrames, empty_arrays, split_log, swarm_section
@@ -101,8 +101,8 @@ def check_format(bag: Bag) -> None:
     """
     if topic := bag.topics.get(SLOT_RECORD):
         recorded = bag.typestore(SLOT_RECORD).fielddefs
-        for kind, found in ((TYPE, topic.type), (_HEADER, _HEADER)):
-            (_, ours), (_, theirs) = _store(TYPE).fielddefs[kind], recorded.get(found, ((), ()))
+        for kind, (_, ours) in _store(TYPE).fielddefs.items():
+            _, theirs = recorded.get(topic.type if kind == TYPE else kind, ((), ()))
             if not dict(ours).items() <= dict(theirs).items():
                 raise UnusableBag(bag.given, f"{SLOT_RECORD} is {topic.type}, without fields of this version's {kind}")
         return
@@ -123,7 +123,7 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
     agents, slot_ms = swarm.get("agents", 0), swarm.get("slot_ms", 10.0)
     if not isinstance(agents, int) or not 0 < agents <= 65535:
         raise UnusableBag(bag.given, "its configuration does not say how many agents there are")
-    slot_ns = round(float(slot_ms) * 1e6) if isinstance(slot_ms, (int, float)) and slot_ms > 0 else 10_000_000
+    slot_ns = round(float(slot_ms) * 1e6) if isinstance(slot_ms, (int, float)) and 0 < slot_ms <= 1e6 else 10_000_000
     try:
         is_whole = merged is None and not {AGENT, SNIFFER} & set(bag.custom_data)
         log = make_log(list(records), agents, slot_ns, is_whole, _name(bag), settings)
@@ -131,11 +131,12 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
         if RECOVERED_FROM in bag.custom_data:
             log.notes.append("This bag was recovered: its recorder was killed or its file was damaged.")
         return log if merged is None else split_log(log, merged["common_slot"])
-    except (ValueError, IndexError, TypeError) as error:
+    except (ValueError, IndexError, TypeError, MemoryError) as error:
         raise UnusableBag(bag.given, f"its slot records do not fit together ({error})") from None
 
 
-_LISTS = "missing", "broken_off", "not_on_the_time_line", "nothing_written", "not_determined", "processes"
+_GAVE_UP = "agents_that_gave_up_a_time"  # bags of earlier versions have none
+_LISTS = "missing", "broken_off", "not_on_the_time_line", "nothing_written", "not_determined", "processes", _GAVE_UP
 _MERGED_KINDS = {"common_slot": int, "frames_heard_not_as_sent": int, **dict.fromkeys(_LISTS, list)}
 
 
@@ -147,9 +148,11 @@ def _merged(bag: Bag) -> dict[str, Any] | None:
     if MERGED_FROM not in bag.custom_data:
         return None
     try:
-        about = json.loads(bag.custom_data[MERGED_FROM])
+        about = {_GAVE_UP: [], **load_json(bag.custom_data[MERGED_FROM])}
         wrong = [name for name, kind in _MERGED_KINDS.items() if not isinstance(about[name], kind)]
         wrong += [name for name in ("p50", "p99") if not isinstance(about["residual_us"][name], float)]
+        if not all(isinstance(group, list) for group in about["not_determined"]):
+            wrong.append("not_determined")
         if wrong or about["common_slot"] < 0:
             raise ValueError(", ".join(wrong) or "common_slot")
     except (ValueError, KeyError, TypeError) as error:

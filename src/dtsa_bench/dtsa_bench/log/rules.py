@@ -106,7 +106,10 @@ class GrantLedger:
         """Whether the owner sends in an anchor, no main one, in probation: it may have given it away before."""
         if data is None or not self._is_anchor(slot) or self._is_main(slot):
             return False
-        return decode_extended(data).probation
+        try:
+            return decode_extended(data).probation
+        except RemoteProtocolError:  # as `note_frame` says
+            return False
 
     def _has_forgotten(self, turn: GrantedTurn, sender: int) -> bool:
         """Whether a sender handed the turn on before it restarted: what others relay may be all that it knows."""

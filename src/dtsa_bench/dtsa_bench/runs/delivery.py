@@ -89,7 +89,7 @@ def recorded_problem(bag: str | Path) -> str:
     try:
         summary = json.loads((Path(bag).resolve().parent.parent / "summary.json").read_text(encoding="utf-8"))
         problem = summary.get("unheard")
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return ""
     return problem[:_LONGEST] if isinstance(problem, str) else ""
 

@@ -15,6 +15,7 @@ from bag_helpers import rewrite
 
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.bag.reader import Bag, BagMessage
+from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.record import SLOT_RECORD, load_log
 from dtsa_bench.log.verify.check import verify_bag
 from dtsa_bench.log.verify.result import Result
@@ -214,6 +215,26 @@ def test_a_missing_message_and_a_wrong_sequence_number_are_found_without_any_dig
     difference = result_of(flight, tmp_path, renumber).difference
     assert difference.what == f"{topic}, sequence number"
     assert int(difference.recorded) == int(difference.expected) + 1
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"slots": 3}', "[" * 100_000])
+def test_a_damaged_summary_beside_a_bag_is_a_difference(flight: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / "bag").mkdir()
+    rewrite(flight, tmp_path / "bag" / "bag_0.mcap")
+    (tmp_path / "summary.json").write_text(text)
+    assert verify_bag(tmp_path).difference.what == "summary.json"
+
+
+@pytest.mark.parametrize(("name", "is_right"), [("/cf\u00b2/odom", True), ("/parameter_events", False)])
+def test_a_topic_of_another_kind_than_its_name_says_ends_in_words(flight, tmp_path, name, is_right):
+    with Bag(flight) as bag, BagWriter(tmp_path / "more.mcap", None, custom_data=bag.custom_data) as copy:
+        channels = {topic.name: copy.add_topic(topic.name, topic.type) for topic in bag.topics.values()}
+        channels[name] = copy.add_topic(name, "nav_msgs/msg/Odometry")
+        messages = list(bag.messages())
+        messages.append(next(m for m in messages if m.topic == "/cf1/odom")._replace(topic=name))
+        for one in messages:
+            copy.write(channels[one.topic], one.data, one.log_time_ns, one.publish_time_ns)
+    assert verify_bag(tmp_path / "more.mcap").ok == is_right
 
 
 def test_an_account_that_is_missing_is_named(flight: Path, tmp_path: Path) -> None:

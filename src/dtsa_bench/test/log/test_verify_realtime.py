@@ -134,6 +134,18 @@ other_sender = first_of("sender", lambda message, was: was % 4 + 1 if len(messag
 other_choice = first_of("chosen", lambda _, was: was + 1)
 
 
+def lost_position(message: Any) -> bool:
+    message.track *= np.nan
+    return len(message.sender) > 0
+
+
+def long_frame(message: Any) -> bool:
+    if len(message.sender) != 1:
+        return False
+    message.length, message.data = np.array([255], np.uint8), np.zeros(255, np.uint8)
+    return True
+
+
 other_outcome = first_of("lost", lambda _, was: was + 1)
 
 
@@ -141,7 +153,7 @@ other_outcome = first_of("lost", lambda _, was: was + 1)
     (frame_byte, "frame"), (sending_time, "offset_ns"), (frame_time, "offset_ns"), (heard_early, "heard_ns"),
     (other_choice, "chosen"), (not_heard, "digest|chosen|score|reason"), (heard_by_all, "heard_by"),
     (own_bit, "received"), (no_receiver, "heard_by|received"), (other_sender, "frame.sender|heard"),
-    (other_outcome, "lost|received, lost"),
+    (other_outcome, "lost|received, lost"), (lost_position, "frame"),
 ])  # fmt: skip
 def test_a_changed_record_is_named(flown: Path, tmp_path: Path, change: Any, what: str) -> None:
     result = rewritten(flown, tmp_path / "changed", once(change))
@@ -187,6 +199,7 @@ def test_radios_behind_lines_are_checked_by_their_times(waiting: Path, tmp_path:
         channel = bag.config["channel"]
     plain = rewritten(waiting, tmp_path / "plain", untouched, channel={**channel, "radio": "plain"})
     assert not plain.ok
+    assert rewritten(waiting, tmp_path / "long", once(long_frame)).difference.what == "length"
 
 
 def test_a_flight_that_an_agent_has_left_is_checked_too(tmp_path: Path) -> None:

@@ -184,9 +184,7 @@ def test_clocks_are_fit_within_groups_connected_both_ways() -> None:
     assert line.flight_ns == pytest.approx(MS, abs=50_000)
 
 
-def _recorded(
-    path: Path, slots: list[int], steps: int = CONFIG.steps, about: dict[str, float] | None = None
-) -> AgentBag:
+def _recorded(path: Path, slots: list[int], steps: int = CONFIG.steps, about: dict[str, Any] | None = None) -> AgentBag:
     """The bag of an agent that took over another time wherever its slots count back; `about`: other values of it."""
     zero, track = np.zeros(3), np.zeros((steps, 3))
     with AgentRecorder(path, AgentSettings(id=1), CONFIG, UdpSettings(interface="lo")) as recorder:
@@ -210,9 +208,10 @@ def test_slots_of_times_that_were_given_up_are_kept_apart(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("about", [
     {"zero_ns": 1 << 70}, {"zero_ns": 1 << 62}, {"zero_ns": float("inf")}, {"started_ns": -(1 << 70)},
-    {"started_ns": 1 << 62},
+    {"started_ns": 1 << 62}, {"port": {"name": "udp", "byte_time_ns": None}},
+    {"port": {"name": "udp", "turn_ns": 1 << 70}},
 ])  # fmt: skip
-def test_times_that_no_clock_shows_are_refused(tmp_path: Path, about: dict[str, float]) -> None:
+def test_times_that_no_clock_or_port_has_are_refused(tmp_path: Path, about: dict[str, Any]) -> None:
     with pytest.raises(UnusableBag, match="what it says of its agent cannot be read"):
         _recorded(tmp_path / "cf1.mcap", [3, 4], about=about)
 

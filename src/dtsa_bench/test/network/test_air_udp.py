@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import resource
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ from typing import Any
 import air_helpers as helpers
 import numpy as np
 import pytest
+from bag_helpers import rewrite
 from rosbags.rosbag2 import Reader
 from waiting import wait_for
 
@@ -26,6 +28,7 @@ from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.bag.metadata import MERGED_FROM
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BagWriter
@@ -205,6 +208,48 @@ def test_bags_of_agents_and_merged_ones_that_lie_are_found(flight: SimpleNamespa
     assert (difference.what, difference.slot, difference.agent) == ("chosen", log.first_slot + row, 2)
 
 
+def _copied(whole: Path, target: Path, custom: dict[str, str]) -> str:
+    """A bag that says other things of itself, finished by the real writer."""
+    with Bag(whole) as bag, BagWriter(target, None, custom_data={**bag.custom_data, **custom}) as copy:
+        channels = {name: copy.add_topic(name, info.type, info.profiles) for name, info in bag.topics.items()}
+        for one in bag.messages():
+            copy.write(channels[one.topic], one.data, one.log_time_ns, one.publish_time_ns)
+    return str(target)
+
+
+def test_a_merged_bag_with_other_control_instants_than_its_settings_is_refused(flight, tmp_path, capsys):
+    with Bag(flight.whole) as bag:
+        settings = {**bag.config, "swarm": {**bag.config["swarm"], "control_ms": 20.0}}
+    lie = _copied(flight.whole, tmp_path / "lie.mcap", {"configuration": json.dumps(settings)})
+    assert main(["verify", lie]) == 1
+    assert main(["export", lie, "--to", "csv", "--out", str(tmp_path / "tables")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("change", [
+    {"agents_that_gave_up_a_time": None}, {"not_determined": [3]}, {"processes": []}, {"processes": [{"agent": 1e999}]},
+    {"residual_us": None}, {"common_slot": 1 << 70},
+])  # fmt: skip
+def test_a_merged_bag_that_lies_of_its_origin_is_found(flight, tmp_path, capsys, change):
+    with Bag(flight.whole) as bag:
+        about = json.loads(bag.custom_data[MERGED_FROM]) | change
+    assert main(["verify", _copied(flight.whole, tmp_path / "lie.mcap", {MERGED_FROM: json.dumps(about)})]) == 1
+    assert capsys.readouterr().err == ""
+
+
+def test_a_damaged_bag_without_room_for_a_copy_is_one_line_and_no_difference(flight, tmp_path):
+    (tmp_path / "cf1.mcap").write_bytes(flight.bags[0].read_bytes()[:-100])
+    for command in ("merge", "verify"):
+        words = [sys.executable, "-m", "dtsa_bench", command, str(tmp_path)]
+        limit = (1 << 12, 1 << 12)  # bytes of a file that it writes
+        done = subprocess.run(
+            words, capture_output=True, text=True, check=False,
+            preexec_fn=lambda limit=limit: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
+        )  # fmt: skip
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done
+        assert str(tmp_path / "cf1.mcap") in done.stderr
+
+
 def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Path) -> None:
     whole = flight.bags[0].read_bytes()
     cut = tmp_path / "cf1.mcap"
@@ -227,6 +272,9 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Pa
     assert bag.damage
     assert 0 < len(bag.log) <= len(read(flight.bags[0]).log)
     assert not verify_bag(cut).ok
+    rewrite(flight.bags[0], cut, use_chunking=False)  # all messages, not as the recorder writes them
+    assert read(cut).damage
+    assert not verify_bag(cut.parent).ok
     for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
         cut.write_bytes(bad)
         with pytest.raises(DtsaError):

@@ -158,7 +158,7 @@ class SwarmConfig(Settings):
     def place_numbers(self) -> list[int]:
         """Numbers (from 1) of the places at which the agents begin, by id; empty: not said."""
         words = self.places.replace(",", " ").split()
-        return [int(word) if word.isascii() and word.isdigit() else 0 for word in words]
+        return [int(word) if word.isascii() and word.isdigit() and len(word) < 10 else 0 for word in words]
 
     @property
     def plug_ins(self) -> list[tuple[str, str]]:

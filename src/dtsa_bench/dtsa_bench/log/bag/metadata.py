@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -130,6 +131,14 @@ def has_packed_messages(content: Mapping[str, Any]) -> bool:
 def unpack_message(data: bytes) -> bytes:
     """One message that rosbag2 compressed by itself; raises ZstdError for a damaged one."""
     return zstandard.ZstdDecompressor().decompress(data, max_output_size=MAX_MESSAGE_BYTES)
+
+
+def load_json(text: str) -> Any:
+    """What a text from outside says as JSON; ValueError: it is none."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("JSON that is nested too deep") from None
 
 
 def custom_data(content: Mapping[str, Any]) -> dict[str, str]:

@@ -7,7 +7,6 @@ all that rosbag2 writes to MCAP, as long as it has an index.
 from __future__ import annotations
 
 import heapq
-import json
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
@@ -93,7 +92,7 @@ class Bag:
         :raises UnusableBag: if the bag holds none.
         """
         try:
-            loaded = json.loads(self.custom_data["configuration"])
+            loaded = metadata.load_json(self.custom_data["configuration"])
         except (KeyError, ValueError):
             raise UnusableBag(self.given, "it holds no configuration: not recorded by this project") from None
         if not isinstance(loaded, dict):

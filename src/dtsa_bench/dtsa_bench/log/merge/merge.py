@@ -162,7 +162,7 @@ def clocks_apart(groups: Sequence[Sequence[str]]) -> str:
     """That clocks of groups cannot be compared, in words; empty where there are none."""
     if not groups:
         return ""
-    named_groups = " | ".join(", ".join(group) for group in groups)
+    named_groups = " | ".join(", ".join(map(str, group)) for group in groups)
     return f"offsets of clocks not determined: frames do not go both ways between {named_groups}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import ns_of
 from dtsa_bench.log.arrays import FlightArrays
 from dtsa_bench.log.bag.cdr import OdometryPacker
-from dtsa_bench.log.bag.errors import UnusableBag
-from dtsa_bench.log.bag.metadata import RUN_ID
+from dtsa_bench.log.bag.errors import BagError, UnusableBag
+from dtsa_bench.log.bag.metadata import RUN_ID, load_json
 from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.writer import BROKEN_OFF, KEY, BagDigest
 from dtsa_bench.log.record import SLOT_RECORD, SNIFFER
@@ -40,6 +39,8 @@ class BagContents:
         self._run = _number(bag, RUN_ID, 16) if RUN_ID in bag.custom_data else None
         self._whole_ns = _number(bag, BROKEN_OFF) if result.broken_off else 1 << 63  # up to which nothing is lost
         self._digest, sequences = BagDigest(), dict.fromkeys(bag.topics, 0)
+        ids = range(1, swarm.agents + 1)
+        bodies = {f"{names.agent_namespace(agent)}/{names.ODOMETRY}": agent for agent in ids}
         for message in bag.messages():
             self._digest.add(*message)
             expected, slot = (
@@ -55,14 +56,18 @@ class BagContents:
             if message.topic == SLOT_RECORD:
                 self._add_record(message)
             elif message.topic == EVENTS:
-                changed = {p.name: p.value for p in bag.decode(message).changed_parameters}
-                if changed:
-                    values = {n: getattr(v, _PARAMETER_VALUES.get(int(v.type), ""), None) for n, v in changed.items()}
+                if values := self._changed_values(message):
                     self.changes.setdefault(slot, {}).update(values)
                     result.count("channel changes")
-            elif message.topic.endswith("/odom"):
-                agent = message.topic.split("/")[1][2:]
-                self._odometry.append((slot, int(agent) if agent.isdigit() else 0, message.data))
+            elif agent := bodies.get(message.topic):
+                self._odometry.append((slot, agent, message.data))
+
+    def _changed_values(self, message: BagMessage) -> dict[str, Any]:
+        try:
+            changed = {p.name: p.value for p in self._bag.decode(message).changed_parameters}
+            return {n: getattr(v, _PARAMETER_VALUES.get(int(v.type), ""), None) for n, v in changed.items()}
+        except (AttributeError, TypeError, ValueError) as error:  # of a type that has these names, but other fields
+            raise BagError(f"{message.topic} at {message.log_time_ns} ns: no changed parameters ({error})") from None
 
     def _add_record(self, message: BagMessage) -> None:
         record, mode = self._bag.decode(message), self._result.mode
@@ -131,7 +136,14 @@ def recorded_summary(log: FlightArrays, result: Result) -> dict[str, Any]:
     """The `summary.json` beside a bag; empty without one."""
     path = Path(str(log.file)).parent.parent / "summary.json"
     if not result.broken_off and path.is_file():
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        try:
+            summary = load_json(path.read_text(encoding="utf-8"))
+            parts = [summary.get(name) or {} for name in ("slots", "not_taken_in")]
+            if not all(isinstance(part, dict) for part in parts):
+                raise ValueError("slots, not_taken_in")
+        except (ValueError, AttributeError, OSError) as error:
+            raise Mismatch("summary.json", "results", f"others ({error})", "they are those of the flight") from None
+        return dict(summary)
     why = "the recording breaks off before the end of the flight" if result.broken_off else "not beside the bag"
     result.skipped["summary.json"] = why
     return {}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import RemoteProtocolError, decode_frame
+from dtsa_agent.core import LocalProtocolError, RemoteProtocolError, decode_frame
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.frame import TAG_LENGTH, Frame, decode_extended, encode_frame
 from dtsa_agent.core.station import check_slotted
@@ -128,7 +128,7 @@ def check_realtime(log: FlightArrays, contents: BagContents, result: Result) -> 
     _compare(log, outcome=np.where(log.recorded, outcome, log.outcome).astype(np.uint8))
     summary = recorded_summary(log, result)
     total = summary.get("slots", {}).get("total", len(log))
-    if abs(total - len(log)) > 1:
+    if not isinstance(total, int) or abs(total - len(log)) > 1:
         raise Mismatch("summary.json: slots", len(log), total, "each has a record")
     if summary:
         result.count("summary.json")
@@ -195,7 +195,7 @@ def check_own_states(log: FlightArrays, result: Result, authenticator: Authentic
     for slot, agent, data, *state in zip(*columns, strict=True):
         try:
             own, expected = _own_states(log, authenticator, slot, agent, data, *state)
-        except RemoteProtocolError as error:
+        except (RemoteProtocolError, LocalProtocolError) as error:  # or its sender's state is in no frame
             raise Mismatch("frame", "a frame", error, "agents send what others can decode", slot, agent) from None
         if own == expected:
             continue
@@ -243,6 +243,9 @@ def check_merged(log: FlightArrays, result: Result) -> None:
     replay = MergedReplay(log).run()
     if first := next((one for process in replay.processes for one in process.replay.differences), None):
         raise _decision_mismatch(first, log)
+    if replay.equal != (recorded := int(whole.known.sum())):
+        why = "each is of one of the processes that the bag names"
+        raise Mismatch("decisions made again", recorded, replay.equal, why)
     result.count("decisions made again", replay.equal)
     if others := about["frames_heard_not_as_sent"] + replay.count_unmatched_frames():
         why = "no agent hears a frame that was not sent"

@@ -49,6 +49,9 @@ class FramesOnAir:
         self.slot, self.sender, data, self.received, self.lost, self.collided = frames
         lengths, airtime = [len(frame) for frame in data], config.airtime
         self._length = np.array(lengths, np.int64)
+        for k in np.flatnonzero(self._length > airtime.longest)[:1].tolist():
+            values = f"{airtime.longest} bytes at most", f"{lengths[k]} bytes"
+            raise Mismatch("length", *values, "the radio takes no longer ones", int(self.slot[k]), int(self.sender[k]))
         # Without other frames; `resolve_again` and `find_times` add those that a radio has to hand over before.
         #: (F,) of the transmission.
         self.end_ns = asked_ns + np.array([airtime.total_ns(length) for length in lengths], np.int64)
