@@ -23,7 +23,6 @@ from dtsa_dev.network.fake_modems import FakeModems, FakeModemSettings
 from dtsa_dev.network.hosts import CABLE, EmulatedHost, hosts
 from dtsa_dev.network.switch import Links, Switch
 
-from dtsa_agent.air.port import HEADER
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import VARIABLE
@@ -281,9 +280,8 @@ def fly(trial: Trial, directory: Path, disturb: Callable[[Any], None], **simulat
         flown = flight.now_ns()
         flight.end()
         medium = flight.findings(begun, flown)
-        airtime = flight.config.airtime if trial.modems is None else None
     merged = Merge(flight.bags())
-    found = merged.summary(*([] if airtime is None else [airtime.on_air_ns(HEADER + trial.swarm.frame_length)]))
+    found = merged.summary()
     assert is_verified(found), (found["decisions_again"], found["turns"]["which"], found["frames_heard_not_as_sent"])
     assert found["flight"] is not None, "they never counted alike"
     write_merged(directory / WHOLE, merged.log, found)
