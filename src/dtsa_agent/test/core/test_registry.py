@@ -10,9 +10,10 @@ import pytest
 from slot_helpers import one_slot
 
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, registry
+from dtsa_agent.core.kernel import NAMES
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, PORT, PolicyRow
 from dtsa_agent.core.settings.declaration import settings_of
-from dtsa_agent.core.settings.flight_models import AVOIDERS
+from dtsa_agent.core.settings.flight_models import AVOIDERS, AvoiderParams, flight_model
 from dtsa_agent.core.station import check_joinable
 
 
@@ -21,6 +22,14 @@ def flown(policy: str, shared: bool) -> Swarm:
     for slot in range(60):
         one_slot(swarm, slot)
     return swarm
+
+
+def test_lists_of_names_are_the_kernels() -> None:
+    assert NAMES["policies"] == POLICIES.names
+    assert NAMES["estimators"] == ESTIMATORS.names
+    assert NAMES["reasons"] == registry.REASONS == tuple(registry.REASON_TEXTS)
+    assert set(NAMES) == {"policies", "estimators", "avoiders", "selections", "profiles", "reasons"}
+    assert NAMES["avoiders"][AVOIDERS.row("bvc").kind] == "bvc"
 
 
 def test_settings_and_rows_have_the_same_names() -> None:
@@ -100,6 +109,13 @@ def test_a_plug_in_named_like_a_built_in_is_refused(monkeypatch: pytest.MonkeyPa
 def test_what_a_policy_declares_is_checked(what: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=f"odd.{what}"):
         POLICIES.register("odd", type("Odd", (), {what: value}))
+
+
+def test_flight_models_take_the_kernels_parameters() -> None:
+    for name in AVOIDERS.names:
+        model = flight_model(name)
+        assert model.kind == NAMES["avoiders"].index(model.avoider_kind)
+        assert set(model.avoider.to_dict()) == {spec.name for spec in settings_of(AvoiderParams)}
 
 
 def test_defaults_are_those_of_the_paper_where_it_has_some() -> None:

@@ -16,10 +16,11 @@ import serial
 from dtsa_dev.network.fake_modems import FakeModems, FakeModemSettings
 from waiting import wait_for
 
-from dtsa_agent.air.serial_port import SerialPort
+from dtsa_agent.air.serial_port import SerialPort, to_line
 from dtsa_agent.air.settings import SerialSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
+from dtsa_bench.log.agent_bag import read
 from dtsa_bench.pages.report.data import run_data
 from dtsa_bench.pages.view.history import RunHistory
 from dtsa_bench.pages.view.network_listener import NetworkListener
@@ -171,6 +172,12 @@ def test_what_cannot_be_is_one_line(words: list[str], said: str, capsys: pytest.
     assert err.count("\n") == 1
 
 
+def test_slots_that_are_too_short_are_refused_before_anything_is_made(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["agent", "--air=serial", "--id=1", "--no-seal", "--modem=sik-64k", "--device=/dev/null", "--slot-ms=20"]
+    assert main(words) == 2
+    assert "slot_ms: got 20.0; allowed: at least" in capsys.readouterr().err
+
+
 def test_a_device_that_may_not_be_opened_is_named(monkeypatch, capsys):
     def refused(*words: object, **more: object) -> None:  # root may open every device
         raise serial.SerialException(errno.EACCES, "could not open port")
@@ -180,3 +187,22 @@ def test_a_device_that_may_not_be_opened_is_named(monkeypatch, capsys):
     assert "allowed: a device that this user may open: add the user to its group, mostly dialout" in (
         capsys.readouterr().err
     )
+
+
+def test_bytes_of_mavlink_are_told_and_the_bag_is_whole(tmp_path: Path) -> None:
+    config = SwarmConfig(agents=2, policy="lease", slot_ms=50.0)
+    with (
+        modems(FakeModemSettings(modem="esp-now", count=2), tmp_path) as made,
+        helpers.flying(config, [port_settings(made, 1)], tmp_path) as (one,),
+    ):
+        heartbeat = bytes.fromhex("fd09000000010100000000000000000203045103")
+        for _ in range(40):
+            made.inject(1, heartbeat * 10)
+            time.sleep(0.005)
+        wait_for(lambda: any("MAVLink" in line for line in one.said))
+        made.inject(1, to_line(b"a stranger's"))
+        wait_for(lambda: one.agent.reports.not_taken_in.total() > 0)
+        helpers.go_on([one], 10)
+    bag = read(tmp_path / "cf1.mcap")
+    assert not bag.broken_off
+    assert len(bag.log) > 10
