@@ -16,13 +16,14 @@ def content(channel: dict[str, Any] | None = None, topics: Any = None, **robot1:
 
 
 def test_a_file_says_all() -> None:
-    channel, robots, topics = RelaySettings.from_dict(
+    transport, robots, topics = RelaySettings.from_dict(
         content(
             {"access": "lease", "slot_ms": 5, "loss": 0.2},
             {"pose": {"type": "geometry_msgs/msg/PoseStamped", "bytes": 24, "to": ["robot3"]}, "/map": None},
             odometry="odom",
         )
     ).read()
+    channel = transport.config
     assert list(robots) == ["robot1", "robot2", "robot3"]
     assert [(robot.odometry, robot.place) for robot in robots.values()] == [
         ("odom", None), (None, (1.0, 2.0, 3.0)), (None, None),

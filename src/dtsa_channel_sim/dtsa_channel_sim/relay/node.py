@@ -29,7 +29,7 @@ from dtsa_agent.stop import Stop, leave_at_once
 from dtsa_agent.yaml_file import read_mapping
 
 from .settings import RelayedTopic, RelaySettings, full_name
-from .transport import COUNTS, RadioMessage, Transport
+from .transport import COUNTS, RadioMessage
 
 _CONFIG = Setting("config", "file", "", "YAML file: robots, topics, channel")
 _DEPTH = 100  # messages of a topic that wait for the relay
@@ -74,11 +74,11 @@ class Relay:
 
     def __init__(self, node: Node, settings: RelaySettings) -> None:
         self._node, self._logger, self._intake = node, node.get_logger(), Intake(node.get_logger())
-        channel, robots, self._awaited = settings.read()
+        self._transport, robots, self._awaited = settings.read()
         for topic in self._awaited:
             if topic.type:
                 message_class(topic.type)
-        self._names, self._transport = list(robots), Transport(channel)
+        self._names = list(robots)
         self._refused: set[str] = set()  # sources with messages that do not fit
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._clock_ns, self._now_ns = node.get_clock().now().nanoseconds, 0

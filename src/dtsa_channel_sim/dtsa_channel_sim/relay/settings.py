@@ -48,8 +48,8 @@ class RelaySettings(Settings):
     channel: Any = setting(None, "settings of the channel", kind="structure")
     map_frame: str = setting("map", "frame of positions")
 
-    def read(self) -> tuple[MessageChannel, dict[str, RelayedRobot], list[RelayedTopic]]:
-        """Return the channel, the robots by namespace without the slash in front, in the order of ids, and all topics.
+    def read(self) -> tuple[Transport, dict[str, RelayedRobot], list[RelayedTopic]]:
+        """Return the medium, the robots by namespace without the slash in front, in the order of ids, and all topics.
 
         :raises ConfigError: naming what cannot be used.
         """
@@ -81,7 +81,7 @@ class RelaySettings(Settings):
                     topics[source] = replace(relayed, robot=robot, name=topic, source=source, receivers=receivers)
         if not topics:
             raise ConfigError("robots", names, "at least one robot with topics")
-        return channel, robots, list(topics.values())
+        return transport, robots, list(topics.values())
 
 
 def full_name(robot: str, name: object, field: str) -> str:
