@@ -19,6 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 from dtsa_msgs.msg import Frame, Report, Slot
@@ -296,9 +297,7 @@ class RealtimeNode(AgentsNode):
             goes_on = message is None or self._receive(message)
             os.sched_yield()  # all agents of this machine hear a frame before any of them goes on
             return goes_on
-        for message in (self.loop.take() for _ in range(_BURST)):
-            if message is None:
-                break
+        for message in islice(iter(self.loop.take, None), _BURST):
             if not self._receive(message):
                 return False
         self._step()
