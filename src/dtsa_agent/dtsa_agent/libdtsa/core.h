@@ -98,7 +98,7 @@ int agent_speak(dtsa_agent *agent, int64_t slot, uint8_t *out); /* -> length of 
 void agent_steer(dtsa_agent *agent, int64_t slot,
                  int step); /* command from the estimates there are */
 
-/* hear.c */
+/* table.c, of frames */
 typedef struct heard_frame {
     extended_frame e; /* of paper frames only e.own */
     int64_t sampled;  /* slot in which its state was sampled */
