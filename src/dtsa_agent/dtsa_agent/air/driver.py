@@ -31,6 +31,7 @@ _SECOND, _NEVER = 1_000_000_000, 1 << 62  # ns
 _SIGNAL_POLL_S = 0.05  # a signal is noticed after this time at the latest
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
 _BURST = 16  # datagrams that are read at a time: whatever comes, the own slots go on
+_BURSTS = 256  # more than wait in any port
 
 
 class AgentVehicle:
@@ -117,8 +118,12 @@ class LiveAgent:
             if stop or now >= end:
                 return
             time.sleep(_SIGNAL_POLL_S)
+        clock, port, now = self.clock, self.port, began
+        for _ in range(_BURSTS):  # what waits since before it listens would have it begin in the past
+            if not port.receive(_BURST):
+                break
         station = self.station = self._start()
-        clock, port, step, now = self.clock, self.port, station.step, began
+        step = station.step
         local, deliver, descriptor = clock.local_ns, port.deliver, [port.fileno()]
         while not ((stop.signal or now >= end) and self._has_ended(stop)):
             count = deliver(station, clock, _BURST)

@@ -167,6 +167,23 @@ def test_what_the_network_refuses_does_not_count_as_sent(monkeypatch: pytest.Mon
     assert all(record.sent_ns > 0 for record in sent)
 
 
+def test_what_came_before_an_agent_listens_does_not_have_it_begin_in_the_past() -> None:
+    udp = UdpSettings(interface="lo", group=f"239.255.78.78:{20_000 + os.getpid() % 10_000}")
+    config = SwarmConfig(agents=2, policy="tdma")
+    slots: list[SlotRecord] = []
+    watcher = SimpleNamespace(slot=slots.append, refused=lambda *unused: None)
+    with UdpPort(udp) as port, UdpPort(udp) as other, UdpPort(udp) as witness, Stop() as stop:
+        there = StationSettings(config, link_of(config, port.properties))
+        for slot in range(1001, 1101, 2):
+            assert not other.send(there.write(framed(2, slot), slot))
+        waited = sum(len(witness.receive(100)) or time.sleep(0.01) or 0 for _ in range(50))
+        LiveAgent(AgentSettings(id=1, duration_s=0.5), config, port, watcher).run(stop)
+    if not waited:
+        pytest.skip("the loopback interface carries no multicast")
+    assert waited == 50
+    assert slots and max(record.slot for record in slots) < 1001
+
+
 def test_a_queue_that_is_full_is_told() -> None:
     """Linux drops a datagram at a full queue, and says so only to those that have asked for it."""
     with UdpPort(UdpSettings(interface="lo")) as end:
