@@ -22,7 +22,7 @@ from dtsa_bench.log.arrays import PRESENT, UNRECORDED
 from dtsa_bench.log.bag.cdr import CdrBuilder, OdometryPacker
 from dtsa_bench.log.bag.metadata import RUN_ID
 from dtsa_bench.log.bag.writer import BagWriter
-from dtsa_bench.log.record import FORMAT, FORMAT_KEY, SLOT_RECORD, TYPE, frame_fields, pack_record
+from dtsa_bench.log.record import FORMAT, FORMAT_KEY, add_records, frame_fields, pack_record
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import Change
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
@@ -54,7 +54,7 @@ class FlightRecorder(ChannelObserver):
         custom = {"seed": str(run.swarm.seed), RUN_ID: f"{run_id:08x}", FORMAT_KEY: FORMAT}
         self.bag = BagWriter(directory, run.to_dict(), custom_data=custom, marked=True)
         add = self.bag.add_topic
-        self._record = add(SLOT_RECORD, TYPE)
+        self._record = add_records(self.bag)
         self._markers = add(f"{names.SWARM}/{names.MARKERS}", "visualization_msgs/msg/MarkerArray")
         self._status = add(f"{names.SWARM}/{names.STATUS}", "dtsa_msgs/msg/RunStatus", "latched")
         settings = add(f"{names.SWARM}/{names.CONFIGURATION}", "dtsa_msgs/msg/Configuration", "latched")

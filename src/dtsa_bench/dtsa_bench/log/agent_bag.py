@@ -40,7 +40,7 @@ from dtsa_bench.log.record import (
     FORMAT,
     FORMAT_KEY,
     SLOT_RECORD,
-    TYPE,
+    add_records,
     check_format,
     frame_fields,
     make_log,
@@ -111,7 +111,7 @@ class RecordFile:
         settings = {"swarm": swarm.to_dict(), "mode": REALTIME}
         self.failure = ""
         self._bag = BagWriter(path, settings, chunk_size=_CHUNK, custom_data={FORMAT_KEY: FORMAT, **custom})
-        self._channel = self._bag.add_topic(SLOT_RECORD, TYPE)
+        self._channel = add_records(self._bag)
 
     def write(self, time_ns: int, data: bytes) -> None:
         """Record a message."""

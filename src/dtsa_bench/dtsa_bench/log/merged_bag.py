@@ -26,8 +26,7 @@ from dtsa_bench.log.record import (
     CONFIGURATION,
     FORMAT,
     FORMAT_KEY,
-    SLOT_RECORD,
-    TYPE,
+    add_records,
     frame_fields,
     load_log,
     pack_configuration,
@@ -88,7 +87,7 @@ def _write_bag(directory: Path, log: FlightArrays) -> None:
     with BagWriter(directory, log.settings, custom_data=custom) as bag:
         about_run = bag.add_topic(f"{names.SWARM}/{names.CONFIGURATION}", CONFIGURATION, "latched")
         bag.write(about_run, pack_configuration(run, log.settings), names.TIME_ZERO_NS, names.TIME_ZERO_NS)
-        record, viewer = bag.add_topic(SLOT_RECORD, TYPE), _Viewer(bag, log.config.swarm)
+        record, viewer = add_records(bag), _Viewer(bag, log.config.swarm)
         for row in range(len(whole)):
             slot, outcome = whole.first_slot + row, int(whole.outcome[row])
             at_ns = names.slot_time_ns(slot, log.slot_ns)

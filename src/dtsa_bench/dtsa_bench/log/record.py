@@ -17,6 +17,7 @@ from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import UnusableBag
 from dtsa_bench.log.bag.metadata import MERGED_FROM, RECOVERED_FROM, load_json
 from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.bag.writer import BagWriter
 
 from .arrays import DECIDED, PRESENT, UNKNOWN, VECTORS, ReceivedFrames, empty_arrays, split_log, swarm_section
 from .flight_log import FlightLog
@@ -64,6 +65,15 @@ def pack_record(run: int, slot: int, time_ns: int, steps: int, outcome: int = UN
     head = {"header": _header(time_ns), "run": run, "slot": slot, "outcome": outcome, "steps": steps}
     store = _store(TYPE)
     return bytes(store.serialize_cdr(store.types[TYPE](**head, **_NOTHING | arrays), TYPE))
+
+
+def add_records(bag: BagWriter) -> int:
+    """The number of a new topic for slot records.
+
+    To make the first record takes 20 ms: longer than slots in which an agent must go on. One is made here.
+    """
+    pack_record(0, 0, 0, 1)
+    return bag.add_topic(SLOT_RECORD, TYPE)
 
 
 def frame_fields(frames: Mapping[int, bytes], received: NDArray[np.bool_] | None) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.log import record
 from dtsa_bench.log.bag import schema
 from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.bag.reader import Bag
@@ -152,3 +153,12 @@ def test_directories_in_use_closed_bags_and_wrong_messages_are_refused(tmp_path:
             writer.add_topic("/odom", kind, "reliable", definition(kind))
     with Bag(tmp_path / "bag") as bag:
         assert bag.topics["/odom"].count == 0
+
+
+def test_no_definition_is_read_once_a_flight_has_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Types of messages take 20 ms to make: an agent with slots of 5 ms would lose four of them."""
+    record._store.cache_clear()
+    with BagWriter(tmp_path / "bag", {"mode": "realtime"}) as bag:
+        topic = record.add_records(bag)
+        monkeypatch.setattr(schema, "typestore_of", None)
+        bag.write(topic, record.pack_record(1, 2, 3, 1, agent=[1], track=[0.0, 1.0, 2.0]), SECOND, SECOND)
