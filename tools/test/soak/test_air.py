@@ -96,6 +96,7 @@ def test_cold_start(slot_ms: float, loss: float, strict: bool, tmp_path: Path, r
     shortcuts = {"open_every": 0, "adoption": False} if strict else {}
     found = _fly(tmp_path, seed, slot_ms, loss, **shortcuts)
     flown, medium = found["flight"], found["medium"]
+    assert found["common_after_last_start_s"] > 0, "one began in the past"
     assert not flown["collided"]
     assert max(found["held_slots"].values(), default=0) <= HELD_SLOTS
     assert medium["overlap_slots"] <= (0.0 if strict else OVERLAP) * medium["slots"]
