@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 import zstandard
+from lz4.frame import LZ4FrameDecompressor
 from mcap.records import Metadata
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
@@ -24,7 +25,7 @@ RECORD_KEY = "serialized_metadata"
 RUN_ID = "run"  # name of the run's id in custom data, 8 hexadecimal digits
 MERGED_FROM = "merged_from"  # custom data of a bag that was made from the bags of agents on a network, as JSON
 RECOVERED_FROM = "recovered_from"  # custom data of a bag that `recover` has made: name of the damaged file
-MAX_MESSAGE_BYTES = 1 << 30  # of a message that is compressed by itself; for one that does not say its size
+MAX_UNPACKED_BYTES = 1 << 28  # of a chunk, or of a message that is compressed by itself
 
 Profile = dict[str, Any]  # quality of service of a publisher, with the fields of rosbag2
 
@@ -128,9 +129,28 @@ def has_packed_messages(content: Mapping[str, Any]) -> bool:
     return str(content.get("compression_mode", "")).lower() == "message"
 
 
-def unpack_message(data: bytes) -> bytes:
-    """One message that rosbag2 compressed by itself; raises ZstdError for a damaged one."""
-    return zstandard.ZstdDecompressor().decompress(data, max_output_size=MAX_MESSAGE_BYTES)
+def unpack(data: bytes, compression: str = "zstd", size: int = 0) -> bytes:
+    """A chunk, or a message that rosbag2 compressed by itself.
+
+    :param compression: of it, by MCAP's name.
+    :param size: bytes at most when it is unpacked, as its chunk says; 0: not known.
+    :raises ValueError: if it is damaged, or larger than `MAX_UNPACKED_BYTES`.
+    """
+    try:
+        stated = max(size, zstandard.frame_content_size(data) if compression == "zstd" else 0)
+        if stated > MAX_UNPACKED_BYTES:
+            raise ValueError(f"{stated} bytes when unpacked, more than {MAX_UNPACKED_BYTES >> 20} MiB")
+        if compression == "zstd":
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=stated or MAX_UNPACKED_BYTES)
+        if compression != "lz4":
+            raise ValueError(f"its compression {compression!r} is not known")
+        reader = LZ4FrameDecompressor()
+        unpacked: bytes = reader.decompress(data, max_length=stated)
+    except (zstandard.ZstdError, RuntimeError) as error:  # of lz4
+        raise ValueError(str(error)) from None
+    if not reader.eof:
+        raise ValueError("it is cut off, or larger than it says")
+    return unpacked
 
 
 def load_json(text: str) -> Any:

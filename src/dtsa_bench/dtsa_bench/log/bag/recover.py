@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from mcap.records import Channel, Header, Message, Metadata, Schema
-from zstandard import ZstdError
 
 from . import metadata
 from .errors import NothingWritten, UnusableBag
@@ -107,7 +106,7 @@ class _Copy:
     """What is copied to a new bag; `packed`: messages are compressed one by one, and are unpacked."""
 
     def __init__(self, writer: BagWriter, packed: bool) -> None:
-        self._writer, self._unpack = writer, metadata.unpack_message if packed else bytes
+        self._writer, self._unpack = writer, metadata.unpack if packed else bytes
         self._topics: dict[str, tuple[int, Topic]] = {}  # channel of the new bag, by name
         self.lost: Counter[str] = Counter()  # by why it is lost
 
@@ -120,7 +119,7 @@ class _Copy:
             if isinstance(record, Message):
                 try:
                     data = self._unpack(record.data)
-                except (ZstdError, MemoryError):
+                except ValueError:
                     self.lost["messages cannot be unpacked"] += 1
                     continue
                 if target := targets.get(record.channel_id, 0):
