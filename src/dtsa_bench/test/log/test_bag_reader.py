@@ -167,3 +167,11 @@ def test_texts_of_the_recorder_stay_texts_without_quotes() -> None:
     loaded = metadata.load(text)
     assert loaded["version"] == "9"
     assert metadata.custom_data(loaded) == {"version": "1.10", "seed": "007", "yes": "no", "empty": ""}
+    many = "".join(f"  a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 30))  # 10^30 texts
+    bomb = f"custom_data:\n  a0: &a0 [x, x]\n  a: b\n{many}relative_file_paths: [*a29]\ncompression_mode: *a29\n"
+    loaded = metadata.load(bomb)
+    assert metadata.custom_data(loaded) == {"a": "b"}
+    assert not metadata.has_packed_messages(loaded)
+    for deep in ("[" * 100_000, "- " * 100_000, "? " * 100_000):  # in C: the end of the process
+        assert metadata.load(deep) == {}
+        assert metadata.load_profiles(deep) == ()
