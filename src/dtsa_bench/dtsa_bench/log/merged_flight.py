@@ -257,7 +257,9 @@ class MergedReplay:
             for k in active:
                 if self.processes[k].last == slot:  # it has ended: what it knew last does not grow old
                     tables.in_ap[np.searchsorted(observers, self.processes[k].agent)] = 0
-        self.results = None if start is None else _results(metrics, self._log.first_slot, start - common) | pairs.summary()
+        self.results = (
+            None if start is None else _results(metrics, self._log.first_slot, start - common) | pairs.summary()
+        )
 
     @property
     def notes(self) -> list[str]:

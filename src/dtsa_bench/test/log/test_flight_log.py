@@ -124,7 +124,10 @@ def test_what_has_no_room_in_memory_is_refused_by_name_before_it_is_asked_for(ba
     memory = tmp_path / "meminfo"
     memory.write_text("MemTotal:       24576000 kB\nMemAvailable:         10 kB\n")
     monkeypatch.setattr(options, "_MEMORY", memory)
-    for words in (["simulate", "--picture", tmp_path / "a.png"], ["export", bag, "--to", "csv", "--out", tmp_path / "a"]):
+    for words in (
+        ["simulate", "--picture", tmp_path / "a.png"],
+        ["export", bag, "--to", "csv", "--out", tmp_path / "a"],
+    ):
         assert main(list(map(str, words))) == 2
         said = capsys.readouterr().err
         assert "agents: got" in said
