@@ -219,7 +219,11 @@ def recorded(out: str, agent: LiveAgent, port: PortSettings) -> Iterator[AgentRe
         agent.watcher = recorder
         yield recorder
         recorder.finish(agent.summary())
-    (directory / "summary.json").write_text(json.dumps(recorder.summary, indent=2) + "\n", encoding="utf-8")
+    file = directory / "summary.json"
+    try:
+        file.write_text(json.dumps(recorder.summary, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        recorder.failure = recorder.failure or f"cannot write {file}: {error.strerror or error}"
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------

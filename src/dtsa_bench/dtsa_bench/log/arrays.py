@@ -16,6 +16,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.frame import EXTENT_M
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.runs.options import check_memory
 from dtsa_channel_sim.model.verdict import OUTCOMES
 
 UNKNOWN = len(OUTCOMES)  # outcome of a slot of which not all that could have sent have told
@@ -272,7 +273,12 @@ def extent_of(settings: Mapping[str, Any]) -> float:
 
 
 def empty_arrays(slots: int, agents: int, steps: int, slot_ns: int) -> dict[str, Any]:
-    """The arrays of a log of which nothing is known yet, by their names."""
+    """The arrays of a log of which nothing is known yet, by their names.
+
+    :raises ConfigError: if there is no memory for them.
+    """
+    what = f"{slots} slots of {steps} control instants"
+    check_memory(8 * 3 * (steps + len(VECTORS)) * slots * agents, what, "agents", agents)  # the larger part of them
     shape, planes = (slots, agents), (slots, 3, agents)
     kinds = {
         "length": np.uint8, "lost": np.uint16, "collided": np.uint16, "chosen": np.uint16, "reason": np.uint8,

@@ -257,7 +257,9 @@ class MergedReplay:
             for k in active:
                 if self.processes[k].last == slot:  # it has ended: what it knew last does not grow old
                     tables.in_ap[np.searchsorted(observers, self.processes[k].agent)] = 0
-        self.results = None if start is None else _results(metrics, log.first_slot + start) | pairs.summary()
+        self.results = (
+            None if start is None else _results(metrics, self._log.first_slot, start - common) | pairs.summary()
+        )
 
     @property
     def notes(self) -> list[str]:
@@ -295,20 +297,24 @@ def _update_track(
     return here
 
 
-def _results(metrics: FlightMetrics, first: int) -> dict[str, Any]:
-    """The results of the flight, with slots and times counted from its first slot."""
+def _results(metrics: FlightMetrics, zero: int, first: int) -> dict[str, Any]:
+    """The results of the flight, with slots and times counted from slot 0 of its log, the completion from their first.
+
+    :param zero: number that the agents gave slot 0.
+    :param first: slot of the log with which the results begin.
+    """
     found = {name: value for name, value in metrics.summary().items() if name not in _NOT_MEANT}
-    slot_s, flown = metrics.run.swarm.slot_s, metrics.slots - first
+    slot_s, flown = metrics.run.swarm.slot_s, metrics.slots - zero - first
     found["slots"]["total"] = flown
-    for name in ("min_distance_time_s", "completion_time_s"):
+    for name, since in (("min_distance_time_s", zero * slot_s), ("completion_time_s", (zero + first) * slot_s)):
         if found[name] is not None:
-            found[name] -= first * slot_s
+            found[name] -= since
     for name in ("frames_per_s", "bytes_per_s"):
         if found[name] is not None:
             found[name] *= metrics.slots / flown
     found["flight_time_s"] = flown * slot_s
     if found["first_divergence_slot"] is not None:
-        found["first_divergence_slot"] -= first
+        found["first_divergence_slot"] -= zero
     return found
 
 

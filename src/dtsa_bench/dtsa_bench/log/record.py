@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_agent.core.errors import shown
+from dtsa_agent.core.settings.config import MAX_AGENTS
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.cdr import SECOND, ns_of, pack_received, split_frames, unpack_received
 from dtsa_bench.log.bag import schema
@@ -131,12 +133,13 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
     merged = _merged(bag)
     swarm = swarm_section(settings)
     agents, slot_ms = swarm.get("agents", 0), swarm.get("slot_ms", 10.0)
-    if not isinstance(agents, int) or not 0 < agents <= 65535:
-        raise UnusableBag(bag.given, "its configuration does not say how many agents there are")
+    if not isinstance(agents, int) or not 0 < agents <= MAX_AGENTS:
+        raise UnusableBag(bag.given, f"its configuration says agents {shown(agents)}, not 1 to {MAX_AGENTS}")
     slot_ns = round(float(slot_ms) * 1e6) if isinstance(slot_ms, (int, float)) and 0 < slot_ms <= 1e6 else 10_000_000
+    found = list(records)
     try:
         is_whole = merged is None and not {AGENT, SNIFFER} & set(bag.custom_data)
-        log = make_log(list(records), agents, slot_ns, is_whole, _name(bag), settings)
+        log = make_log(found, agents, slot_ns, is_whole, _name(bag), settings)
         log.file, log.version, log.merged = bag.path, bag.custom_data.get("version", ""), merged
         if RECOVERED_FROM in bag.custom_data:
             log.notes.append("This bag was recovered: its recorder was killed or its file was damaged.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ _SECTIONS: tuple[tuple[str, type[Settings], tuple[str, ...]], ...] = (
     ("channel", ChannelConfig, FROM_SWARM),
     ("limits", RunLimits, ()),
 )
+_MEMORY = Path("/proc/meminfo")
 _TITLES = {"swarm": "the swarm", "channel": "the radio channel", "limits": "the end of a run"}
 
 
@@ -144,6 +146,19 @@ def named_values(words: Iterable[str]) -> dict[str, Any]:
         except yaml.YAMLError:
             raise ConfigError("set", word, "NAME=VALUE with a plain value") from None
     return values
+
+
+def check_memory(needed: int, what: str, name: str, value: object) -> None:
+    """Whether this machine has memory for something, before it is asked for.
+
+    :param needed: bytes.
+    :param what: what they are for.
+    :raises ConfigError: if it has not; it names the setting.
+    """
+    free = re.search(r"^MemAvailable: *(\d+) kB$", _MEMORY.read_text() if _MEMORY.exists() else "", re.MULTILINE)
+    if free and needed > int(free[1]) << 10:
+        sizes = f"{what} would need {needed / 2**30:.1f} GiB, {int(free[1]) / 2**20:.1f} GiB are free"
+        raise ConfigError(name, value, f"what fits into this machine's memory: {sizes}")
 
 
 def check_free(directory: Path, name: str = "out") -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import numpy as np
@@ -10,13 +11,14 @@ from numpy.typing import NDArray
 from dtsa_agent.core import Swarm
 from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.core.kernel import ffi, lib, memory, shared_arrays
+from dtsa_bench.runs.options import check_memory
 from dtsa_channel_sim import Verdict
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
-_CAPACITY = 1024  # slots to begin with
+_CAPACITY = 64  # slots to begin with
 _OF_FRAMES = ("received", "data")
 _OF_OBSERVER = ("heard_slot", "heard_position", "estimate", "in_ap")
 
@@ -93,13 +95,15 @@ class SlotWriter:
             self._grow(max(log.capacity, 2 * log.rows), max(log.frame_capacity, 2 * log.frames + agents))
 
     def _grow(self, slots: int, frames: int) -> None:
-        log = self.kernel
+        log, config = self.kernel, self._swarm.config
+        old = {name: getattr(self._arrays, name) for name in self._kept}
+        shapes = {name: (frames if name in _OF_FRAMES else slots, *one.shape[1:]) for name, one in old.items()}
+        needed = sum(math.prod(shape) * old[name].itemsize for name, shape in shapes.items())
+        check_memory(needed, f"{slots} slots of {config.steps} control instants", "agents", config.agents)
         log.capacity, log.frame_capacity = slots, frames
-        for name in self._kept:
-            old, of_frames = getattr(self._arrays, name), name in _OF_FRAMES
-            rows = log.frames if of_frames else log.rows
-            array = np.empty((frames if of_frames else slots, *old.shape[1:]), old.dtype)
-            array[:rows] = old[:rows]
+        for name, shape in shapes.items():
+            rows, array = log.frames if name in _OF_FRAMES else log.rows, np.empty(shape, old[name].dtype)
+            array[:rows] = old[name][:rows]
             setattr(self._arrays, name, array)
             self._lent[name] = memory(array, writable=True)
             setattr(log, name, self._lent[name])

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import threading
+import time
 from pathlib import Path
 
+import air_helpers as helpers
 import pytest
 from cli_helpers import refused
 
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_bench.commands.cli import main
 from dtsa_bench.commands.network import read_network_options
 from dtsa_bench.commands.registry import load_command
 from dtsa_bench.runs.options import option_values
@@ -79,3 +83,21 @@ def test_a_file_that_holds_no_settings_is_named(tmp_path, content, capsys):
     if content is not None:
         path.write_bytes(content)
     assert str(path) in refused(["agent", "--id", "1", "--swarm", str(path)], capsys)
+
+
+def test_a_summary_that_cannot_be_written_is_printed_and_the_file_is_named(tmp_path, capsys):
+    """As on a disk that has become full: here a directory is in its place."""
+    helpers.need_multicast()
+    out = tmp_path / "cf1"
+
+    def block() -> None:
+        while not (out / "cf1.mcap").exists():
+            time.sleep(0.01)
+        (out / "summary.json").mkdir()
+
+    threading.Thread(target=block, daemon=True).start()
+    words = ("--no-seal", "--agents", "2", "--quorum", "0", "--interface", "lo", "--group", helpers.own_group())
+    assert main(["agent", "--id", "1", "--duration-s", "1", "--out", str(out), *words]) == 1
+    said = capsys.readouterr()
+    assert said.out.startswith("state")
+    assert f"cannot write {out / 'summary.json'}" in said.err.splitlines()[-1]

@@ -20,7 +20,7 @@ from rclpy.node import Node
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
-from dtsa_agent.core.frame import encode_frame
+from dtsa_agent.core.frame import encode_frame, named_in
 from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Feed
@@ -163,12 +163,16 @@ class LateSender(ChannelObserver):
         shown = {"settings": json.dumps(settings), "settings_hash": settings_hash(settings)}
         self._processes.publish(Process(run=run_id, process=1, node="/test", agent=[1, 2], **shown))
         self._report(slot if self._begin_s else names.FIRST_CALL)
-        if slot > 50 and not self._sent:
+        if slot > 120 and not self._sent:
             self._sent = True
-            for agent, start in ((1, slot - 40), (2, slot)):
-                header = header_of(names.slot_time_ns(start, slot_ns))
-                data = encode_frame(RadioFrame(agent, slot, 1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-                self._air.publish(Frame(header=header, run=run_id, slot=slot, agent=agent, data=data))
+            for agent, number, start in self._sent_in(slot):
+                header = header_of(round(names.slot_time_ns(0, slot_ns) + start * slot_ns))
+                data = encode_frame(RadioFrame(agent, number, 1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+                self._air.publish(Frame(header=header, run=run_id, slot=number, agent=agent, data=data))
+
+    def _sent_in(self, slot: int) -> list[tuple[int, int, float]]:
+        """Sender, number of the slot that it counts, and start in slots of the frames that are sent in one."""
+        return [(1, slot, slot - 40), (2, slot, slot)]
 
     def _report(self, slot: int, place: float = 0.0) -> None:
         places, nothing = [place] * 6, [0.0] * 6
@@ -271,6 +275,23 @@ def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_pat
     assert channel.air.late == 1
     # That of agent 1 disturbed nobody; agent 2 was heard by the one other agent.
     assert sender.frames == [(2, [True, False], 0)]
+
+
+class BehindSender(LateSender):
+    """Agent 1 counts slots that are long over, and sends twice in one."""
+
+    def _sent_in(self, slot: int) -> list[tuple[int, int, float]]:
+        return [(1, 0, slot), (1, 1, slot + 0.1)]
+
+    def arbitrated(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        self.frames += [(named_in(answers.frames[sender]) or (0, 0))[1] for sender in verdict.senders]
+
+
+@pytest.mark.ros
+@pytest.mark.realtime
+def test_two_frames_of_one_sender_in_one_slot_are_both_there(tmp_path: Path) -> None:
+    _, sender = flown_with(BehindSender, tmp_path, slots=150)
+    assert sender.frames == [0, 1]
 
 
 def test_a_path_that_grows_too_long_keeps_every_second_slot(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,6 @@ from rosbags.rosbag2 import Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
-from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands import cli
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import UnusableBag
@@ -26,9 +25,7 @@ from dtsa_bench.log.bag.reader import Bag, BagMessage
 from dtsa_bench.log.bag.recover import recover
 from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.record import load_log
-from dtsa_bench.log.verify.check import verify_bag
-from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
-from dtsa_channel_sim import ChannelConfig
+from dtsa_bench.runs.config import RunConfig
 
 Row = tuple[str, int, int, int, bytes]
 
@@ -60,30 +57,6 @@ def check(run: SyntheticRun, path: Path, target: Path) -> None:
             assert {name: topic.count for name, topic in opened.topics.items()} == run.writer.counts
             assert opened.start_ns == SECOND
         assert len(load_log(bag).outcome) == 39  # the last one is not answered
-
-
-@pytest.mark.ros
-def test_a_flight_verifies_however_it_is_kept(tmp_path: Path) -> None:
-    pytest.importorskip("dtsa_msgs.msg")
-    from dtsa_bench.flights.flight import FlightOptions, fly
-
-    swarm = SwarmConfig(agents=4, policy="lease", slot_ms=20.0, seed=3)
-    flight = RunConfig(swarm, ChannelConfig(loss=0.2, **from_swarm(swarm)), RunLimits(timeout_s=1.0, tail_s=1.0))
-    fly(flight, tmp_path / "whole", FlightOptions(processes=2))
-    bag = tmp_path / "whole" / "bag"
-    slots = verify_bag(bag).slots
-    assert slots
-    rewrite(bag / "bag_0.mcap", tmp_path / "short" / "bag_0.mcap", repeat_channels=False, repeat_schemas=False)
-    rewrite(bag / "bag_0.mcap", tmp_path / "filtered" / "bag_0.mcap", records=False)
-    shutil.copy(bag / "metadata.yaml", tmp_path / "filtered")
-    rewrite(bag / "bag_0.mcap", tmp_path / "split" / "bag_0.mcap", edit=within(0, 2 * SECOND))
-    rewrite(bag / "bag_0.mcap", tmp_path / "split" / "bag_1.mcap", edit=within(2 * SECOND, 1 << 62))
-    for name in ("short", "filtered", "split"):
-        recover(tmp_path / name, tmp_path / f"{name}_recovered")
-        for path in (tmp_path / name, tmp_path / f"{name}_recovered"):
-            verified = verify_bag(path)
-            assert verified.ok, (path, verified.difference)
-            assert (verified.slots, verified.broken_off) == (slots, False)
 
 
 def test_a_summary_without_channels_and_schemas(run: SyntheticRun, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import random
 import re
 import shutil
@@ -198,6 +199,21 @@ def test_a_whole_bag_is_copied_what_is_missing_is_counted_and_what_is_there_stay
     with pytest.raises(ConfigError, match="empty or does not exist"):
         recover(run.writer.directory, run.writer.directory)
     assert {path.name for path in tmp_path.iterdir()} == {"note", "new", "bad.mcap", "less"}
+
+
+@pytest.mark.parametrize("name", ["new", "new.mcap"])
+def test_what_was_interrupted_leaves_nothing_that_passes_for_all(run, tmp_path, monkeypatch, name):
+    write, count = writer.BagWriter.write, itertools.count()
+
+    def interrupted(*arguments: object) -> None:
+        write(*arguments)
+        if next(count) == 50:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(writer.BagWriter, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        recover(run.writer.directory, tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_topic_of_which_nothing_is_left_is_named(tmp_path: Path) -> None:

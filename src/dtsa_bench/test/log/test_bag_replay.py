@@ -28,7 +28,6 @@ from bag_helpers import (
     synthetic_bag,
     synthetic_run,
 )
-from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from dtsa_agent.core.errors import ConfigError
@@ -151,15 +150,6 @@ def test_impossible_rates_starts_and_topics_are_refused(run: SyntheticRun) -> No
             play(run, start_s=start)
     with pytest.raises(UnusableBag, match="no topic"):
         play(run, topics=["/swarm/nothing"])
-
-
-def test_a_damaged_chunk_ends_the_playing_with_an_error(run: SyntheticRun, tmp_path: Path) -> None:
-    data = bytearray(run.writer.path.read_bytes())
-    with run.writer.path.open("rb") as stream:
-        data[make_reader(stream).get_summary().chunk_indexes[-1].chunk_start_offset + 100] ^= 1
-    (tmp_path / "bad.mcap").write_bytes(data)
-    with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match="recover"):
-        Player(bag, Listener(), rate=100.0).play()
 
 
 def need_ros() -> None:

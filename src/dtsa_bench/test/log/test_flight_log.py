@@ -23,6 +23,7 @@ from dtsa_bench.log.bag.writer import BagWriter
 from dtsa_bench.log.record import AGENT, SLOT_RECORD, TYPE, load_log, pack_record
 from dtsa_bench.log.tables import COLUMNS, table
 from dtsa_bench.log.verify.check import verify_bag
+from dtsa_bench.runs import options
 from dtsa_bench.runs.config import RunConfig
 
 ARRAYS = ("outcome", "length", "lost", "collided", "chosen", "reason", "digest", "score", "velocity", "command", "goal")
@@ -117,6 +118,20 @@ def test_records_that_do_not_fit_together_are_one_line(bag: Path, tmp_path: Path
     with pytest.raises(UnusableBag, match="do not fit together") as caught:
         load_log(changed)
     assert "\n" not in str(caught.value)
+
+
+def test_what_has_no_room_in_memory_is_refused_by_name_before_it_is_asked_for(bag, tmp_path, monkeypatch, capsys):
+    memory = tmp_path / "meminfo"
+    memory.write_text("MemTotal:       24576000 kB\nMemAvailable:         10 kB\n")
+    monkeypatch.setattr(options, "_MEMORY", memory)
+    for words in (
+        ["simulate", "--picture", tmp_path / "a.png"],
+        ["export", bag, "--to", "csv", "--out", tmp_path / "a"],
+    ):
+        assert main(list(map(str, words))) == 2
+        said = capsys.readouterr().err
+        assert "agents: got" in said
+        assert said.count("\n") == 1
 
 
 def test_control_instants_are_those_of_the_configuration(bag: Path, tmp_path: Path) -> None:

@@ -130,7 +130,10 @@ def test_frames_of_a_time_that_was_given_up_are_no_lies_in_the_merged_bag(bags: 
 
 def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:
     ones = [read(path) for path in bags[:2]]
-    before = Merge(ones).summary()["flight"]
+    together = Merge(ones)
+    before, near = together.summary()["flight"], together.log.distances.set_index("time_s").distance_m
+    until_s = before["min_distance_time_s"] + 1e-6  # the end of a slot, as in the tables counted from slot 0
+    assert near[until_s - CONFIG.slot_s : until_s].min() == pytest.approx(before["min_distance_m"])
     log = ones[1].log
     first, last = log.first_slot, log.first_slot + len(log) - 1
     since = first + (last - first) // 2

@@ -374,7 +374,11 @@ class RealtimeChannel(RosChannel):
         if not slot and not self._goes_on(0, book):
             return False
         self.answers = book
-        resolved = self._resolved.pop(slot, [])
+        found = {verdict.sender: verdict for verdict in reversed(self._resolved.get(slot, []))}
+        # A frame that came late, of a sender that has another one here, counts in the next slot.
+        later = [verdict for verdict in self._resolved.pop(slot, []) if found[verdict.sender] is not verdict]
+        self._resolved[slot + 1] = later + self._resolved.get(slot + 1, [])
+        resolved = [found[sender] for sender in sorted(found)]
         book.frames = {verdict.sender: self.air.frames.pop(verdict.frame_id) for verdict in resolved}
         verdict = Verdict.of([verdict.sender for verdict in resolved], resolved)
         self._observers.arbitrated(slot, book, verdict)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import heapq
 import mmap
 import re
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
 from io import BytesIO
 from pathlib import Path
@@ -29,7 +30,8 @@ from .errors import UnusableBag
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
 MOST_TRIED = 64  # times the size of a file: bytes of what looks like chunks that are tried
-MAX_UNPACKED_BYTES = 1 << 36  # of a file that is compressed as a whole
+MAX_FILE_BYTES = 1 << 36  # of a file that is compressed as a whole, on the disk
+MAX_WAITING_BYTES = 1 << 30  # of messages in memory, of chunks that overlap in time
 _END = struct.Struct("<QQI8s")  # end of a file: where its index begins, and its second part; checksum; magic
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of the entries that follow
 # A chunk up to its compressed records: length, below 2^40; times, size, checksum; compression; length of the records.
@@ -53,7 +55,7 @@ class BagFile:
         if self._stream.read(len(MAGIC)) != MAGIC:
             raise UnusableBag(given, f"{path.name} is not an MCAP file, or its beginning is lost")
         self._stream.seek(0)
-        self.reader = SeekingReader(self._stream, validate_crcs=True)
+        self._reader = SeekingReader(self._stream, validate_crcs=True)
         self.is_closed = False  # whether it has an end
         self.index_fault = ""  # why its index cannot be used; empty: it can
         self.summary = Summary()  # as its index has it; empty if there is none
@@ -61,6 +63,7 @@ class BagFile:
         self.about: dict[str, Any] = {}  # what the recorder says of the bag, likewise
         self.faults: list[str] = []  # where and why its records cannot be read
         self.whole_ns = 1 << 63  # log time of the last message before the first of them
+        self._size = 0  # bytes
         self._tried = 0  # bytes of what looked like chunks
         try:
             self._read_index()
@@ -71,6 +74,7 @@ class BagFile:
 
     def _read_index(self) -> None:
         """Read what stands behind the messages; raises errors of any kind for a damaged file."""
+        self._size = self._stream.seek(0, 2)
         self._stream.seek(-len(MAGIC), 2)
         self.is_closed = self._stream.tell() > 0 and self._stream.read() == MAGIC
         if not self.is_closed:
@@ -79,15 +83,15 @@ class BagFile:
         self._stream.seek(start)
         if start and checksum and zlib.crc32(self._stream.read()[:-12]) != checksum:  # of all that stands before it
             raise McapError("its index does not fit its checksum")
-        summary = self.reader.get_summary()
+        summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
             raise McapError("it has no index")
         self.summary = summary
         with suppress(Exception):  # of a damaged record: whatever the library meets, there is none then
-            for record in self.reader.iter_metadata():
+            for record in self._reader.iter_metadata():
                 if record.name == metadata.RECORD_NAME:
                     self.about |= metadata.load_record(record)
-        self.reader.get_header()
+        self._reader.get_header()
         if summary.statistics.message_count and not summary.chunk_indexes:
             raise McapError("its messages are not in indexed chunks")
         self._complete_channels()
@@ -139,6 +143,50 @@ class BagFile:
         except Exception as error:  # the library meets damaged files with many kinds of errors
             return f"it is damaged ({error or type(error).__name__})"
         return ""
+
+    def messages(
+        self, topics: Collection[str] | None, start_ns: int
+    ) -> Iterator[tuple[Schema | None, Channel, Message]]:
+        """Messages of a file with an index, in order of log time, those of equal time as recorded.
+
+        :param topics: names; None: all.
+        :param start_ns: ns, earliest log time.
+        :raises Exception: of any kind, for a damaged chunk.
+        """
+        channels, schemas = self.summary.channels, self.summary.schemas
+        wanted = {number for number, one in channels.items() if topics is None or one.topic in topics}
+        waiting: list[tuple[int, int, int, Message | None]] = [  # log time, chunk, number in it; None: a whole chunk
+            (index.message_start_time, index.chunk_start_offset, -1, None)
+            for index in self.summary.chunk_indexes
+            if index.message_end_time >= start_ns
+            and (not index.message_index_offsets or wanted & index.message_index_offsets.keys())
+        ]
+        heapq.heapify(waiting)
+        size = 0
+        while waiting:
+            _, offset, _, message = heapq.heappop(waiting)
+            if message is not None:
+                size -= len(message.data)
+                channel = channels[message.channel_id]
+                yield (schemas[channel.schema_id] if channel.schema_id else None), channel, message
+                continue
+            for number, record in enumerate(self._chunk(offset)):
+                if isinstance(record, Message) and record.log_time >= start_ns:
+                    if record.channel_id not in channels:
+                        raise ValueError(f"a message of channel {record.channel_id}, which is not defined")
+                    if record.channel_id in wanted:
+                        heapq.heappush(waiting, (record.log_time, offset, number, record))
+                        size += len(record.data)
+            if size > MAX_WAITING_BYTES:
+                raise ValueError(f"more than {MAX_WAITING_BYTES >> 20} MiB of its chunks overlap in time")
+
+    def _chunk(self, offset: int) -> list[Any]:
+        """The records of the chunk that begins there."""
+        self._stream.seek(offset)
+        opcode, length = PREFIX.unpack(self._stream.read(PREFIX.size))
+        if opcode != Opcode.CHUNK or length > self._size:
+            raise ValueError("no chunk is where the index says")
+        return _parsed(opcode, self._stream.read(length))
 
     def records(self) -> Iterator[Any]:
         """The records that can be read, in their order; a chunk's stand in its place."""
@@ -197,8 +245,8 @@ def _open(path: Path) -> IO[bytes]:
                 reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
                 while block := reader.read(1 << 20):
                     unpacked.write(block)
-                    if unpacked.tell() > MAX_UNPACKED_BYTES:
-                        raise UnusableBag(path, f"it is larger than {MAX_UNPACKED_BYTES >> 30} GiB when unpacked")
+                    if unpacked.tell() > MAX_FILE_BYTES:
+                        raise UnusableBag(path, f"it is larger than {MAX_FILE_BYTES >> 30} GiB when unpacked")
             unpacked.seek(0)
             stack.pop_all()
             return unpacked
@@ -220,4 +268,8 @@ def _parsed(opcode: int, content: bytes) -> list[Any]:
     record = _KINDS[opcode].read(stream)
     if stream.count != len(content):
         raise ValueError("its length is wrong")
-    return breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+    if not isinstance(record, Chunk):
+        return [record]
+    if record.compression:
+        record.data, record.compression = metadata.unpack(record.data, record.compression, record.uncompressed_size), ""
+    return breakup_chunk(record, validate_crc=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import yaml
 import zstandard
+from lz4.frame import LZ4FrameDecompressor
 from mcap.records import Metadata
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
@@ -24,7 +26,7 @@ RECORD_KEY = "serialized_metadata"
 RUN_ID = "run"  # name of the run's id in custom data, 8 hexadecimal digits
 MERGED_FROM = "merged_from"  # custom data of a bag that was made from the bags of agents on a network, as JSON
 RECOVERED_FROM = "recovered_from"  # custom data of a bag that `recover` has made: name of the damaged file
-MAX_MESSAGE_BYTES = 1 << 30  # of a message that is compressed by itself; for one that does not say its size
+MAX_UNPACKED_BYTES = 1 << 28  # of a chunk, or of a message that is compressed by itself
 
 Profile = dict[str, Any]  # quality of service of a publisher, with the fields of rosbag2
 
@@ -58,26 +60,30 @@ def find_files(path: str | Path) -> list[Path]:
         below = sorted(entry.parent.name for entry in bag.glob("*/*.mcap"))
         hint = f"; did you mean one of {', '.join(below[:5])} in it?" if below else ""
         raise UnusableBag(bag, f"the directory holds no .mcap file{hint}")
-    listed = read(bag).get("relative_file_paths") if len(found) > 1 else None
-    if isinstance(listed, list) and listed:
-        names = [Path(str(name)).name.removesuffix(".zstd") for name in listed]
+    names = [name.removesuffix(".zstd") for name in _file_names(read(bag))] if len(found) > 1 else list(found)
+    if names:
         if missing := [name for name in names if name not in found]:
             raise UnusableBag(bag, f"{', '.join(missing[:5])}, which {FILE_NAME} names, is missing: name a file")
-    elif len(found) > 1:
+    else:
         stem = next(iter(found)).rpartition("_")[0]
         names = [f"{stem}_{number}.mcap" for number in range(len(found))]
         if set(names) != set(found):
             raise UnusableBag(
                 bag, f"holds {len(found)} .mcap files that are not the parts of one bag: name one of them"
             )
-    else:
-        names = list(found)
     return [found[name] for name in names]
 
 
 # -- metadata ---------------------------------------------------------------------------------------------------------
-_TextLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # every value as it is written: 1.10 and 007 stay texts
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_TEXTS, _VALUES = "BaseLoader", "SafeLoader"  # of yaml; texts: every value as it is written, 1.10 and 007 too
+_MOST_OPENED = 10_000  # collections in a text
+_OPENED = re.compile(r"[\[{]|[-?](?=\s)")
+
+
+def _parse(text: str, loader: str) -> Any:
+    """What a text says as YAML. The parser in C ends the process in collections that are nested some 20,000 deep."""
+    is_safe = sum(1 for _ in _OPENED.finditer(text)) <= _MOST_OPENED
+    return yaml.load(text, Loader=getattr(yaml, f"C{loader}" if is_safe else loader, getattr(yaml, loader)))
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
@@ -95,7 +101,7 @@ def dump(content: Mapping[str, Any]) -> str:
 def load(text: str) -> dict[str, Any]:
     """A metadata map from its YAML text, all values as texts; empty if the text is none."""
     try:
-        loaded = yaml.load(text, Loader=_TextLoader)
+        loaded = _parse(text, _TEXTS)
     except (yaml.YAMLError, RecursionError):
         return {}
     return loaded if isinstance(loaded, dict) else {}
@@ -118,19 +124,44 @@ def read(directory: Path) -> dict[str, Any]:
 def read_beside(file: Path, given: str | Path) -> dict[str, Any]:
     """What `metadata.yaml` beside a file says, if it is of the bag that was given."""
     content = read(file.parent)
+    return content if file.name in _file_names(content) or Path(given).is_dir() else {}
+
+
+# Values that are no texts are left out, never made texts: aliases of YAML make terabytes of a few lines.
+def _file_names(content: Mapping[str, Any]) -> list[str]:
+    """Names of the files that metadata lists."""
     listed = content.get("relative_file_paths")
-    names = [Path(str(name)).name for name in listed] if isinstance(listed, list) else []
-    return content if file.name in names or Path(given).is_dir() else {}
+    return [Path(name).name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
 
 
 def has_packed_messages(content: Mapping[str, Any]) -> bool:
     """Whether rosbag2 compressed each message by itself."""
-    return str(content.get("compression_mode", "")).lower() == "message"
+    mode = content.get("compression_mode")
+    return isinstance(mode, str) and mode.lower() == "message"
 
 
-def unpack_message(data: bytes) -> bytes:
-    """One message that rosbag2 compressed by itself; raises ZstdError for a damaged one."""
-    return zstandard.ZstdDecompressor().decompress(data, max_output_size=MAX_MESSAGE_BYTES)
+def unpack(data: bytes, compression: str = "zstd", size: int = 0) -> bytes:
+    """A chunk, or a message that rosbag2 compressed by itself.
+
+    :param compression: of it, by MCAP's name.
+    :param size: bytes at most when it is unpacked, as its chunk says; 0: not known.
+    :raises ValueError: if it is damaged, or larger than `MAX_UNPACKED_BYTES`.
+    """
+    try:
+        stated = max(size, zstandard.frame_content_size(data) if compression == "zstd" else 0)
+        if stated > MAX_UNPACKED_BYTES:
+            raise ValueError(f"{stated} bytes when unpacked, more than {MAX_UNPACKED_BYTES >> 20} MiB")
+        if compression == "zstd":
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=stated or MAX_UNPACKED_BYTES)
+        if compression != "lz4":
+            raise ValueError(f"its compression {compression!r} is not known")
+        reader = LZ4FrameDecompressor()
+        unpacked: bytes = reader.decompress(data, max_length=stated)
+    except (zstandard.ZstdError, RuntimeError) as error:  # of lz4
+        raise ValueError(str(error)) from None
+    if not reader.eof:
+        raise ValueError("it is cut off, or larger than it says")
+    return unpacked
 
 
 def load_json(text: str) -> Any:
@@ -144,7 +175,7 @@ def load_json(text: str) -> Any:
 def custom_data(content: Mapping[str, Any]) -> dict[str, str]:
     """The recorder's own texts in a metadata map."""
     custom = content.get("custom_data")
-    return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+    return {key: value for key, value in custom.items() if isinstance(value, str)} if isinstance(custom, dict) else {}
 
 
 def write(directory: Path, content: Mapping[str, Any]) -> None:
@@ -184,6 +215,6 @@ def load_profiles(text: str) -> tuple[Profile, ...]:
     Before Jazzy rosbag2 wrote policies as numbers.
     """
     try:
-        return tuple(dict(entry) for entry in dump_qos_v9(parse_qos(yaml.load(text, Loader=_Loader))))
+        return tuple(dict(entry) for entry in dump_qos_v9(parse_qos(_parse(text, _VALUES))))
     except Exception:  # the library meets texts from outside with many kinds of errors
         return ()

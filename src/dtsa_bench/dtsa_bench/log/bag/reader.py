@@ -99,26 +99,22 @@ class Bag:
             raise UnusableBag(self.given, "its configuration is not a map")
         return loaded
 
-    def messages(
-        self, topics: Collection[str] | None = None, start_ns: int = 0, end_ns: int = (1 << 63) - 1
-    ) -> Iterator[BagMessage]:
+    def messages(self, topics: Collection[str] | None = None, start_ns: int = 0) -> Iterator[BagMessage]:
         """Messages in order of log time, those of equal time as recorded; about two chunks of a file are in memory.
 
         :param topics: names; None: all.
         :param start_ns: ns, earliest log time.
-        :param end_ns: ns, latest log time.
         :raises UnusableBag: if a topic is not in the bag, or a chunk is damaged.
         """
         for name in topics or ():
             self.topic(name)
-        wanted = None if topics is None else set(topics)
-        parts = [self._messages(file, wanted, start_ns, end_ns) for file in self._files]
+        parts = [self._messages(file, topics, start_ns) for file in self._files]
         return heapq.merge(*parts, key=lambda message: message.log_time_ns) if len(parts) > 1 else parts[0]
 
-    def _messages(self, file: BagFile, wanted: set[str] | None, start_ns: int, end_ns: int) -> Iterator[BagMessage]:
-        unpack = metadata.unpack_message if self._has_packed_messages else bytes
+    def _messages(self, file: BagFile, topics: Collection[str] | None, start_ns: int) -> Iterator[BagMessage]:
+        unpack = metadata.unpack if self._has_packed_messages else bytes
         try:
-            for schema, channel, message in file.reader.iter_messages(wanted, starting_at=start_ns, ending_at=end_ns):
+            for schema, channel, message in file.messages(topics, start_ns):
                 kind, data = schema.name if schema else "", unpack(message.data)
                 yield BagMessage(channel.topic, kind, message.log_time, message.publish_time, message.sequence, data)
         except Exception as error:  # the libraries meet damage with many kinds of errors

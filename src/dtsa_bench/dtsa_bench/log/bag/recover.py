@@ -8,14 +8,13 @@ damaged place is the flight up to the end of one. Messages stay as they are enco
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mcap.records import Channel, Header, Message, Metadata, Schema
-from zstandard import ZstdError
 
 from . import metadata
 from .errors import NothingWritten, UnusableBag
@@ -60,7 +59,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
         files = [BagFile(part, path, stack) for part in paths]
         profile, about = _begin(files, path)
         custom_data = {**metadata.custom_data(about), metadata.RECOVERED_FROM: result.source.name}
-        with BagWriter(result.directory, None, custom_data=custom_data, profile=profile) as writer:
+        with _new_bag(result.directory, custom_data, profile) as writer:
             copy = _Copy(writer, metadata.has_packed_messages(about))
             for file in files:
                 copy.add(file)
@@ -80,6 +79,21 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
     if expected > result.count:
         result.damaged.append(f"{expected - result.count} of the {expected} messages that the bag had are lost")
     return result
+
+
+@contextmanager
+def _new_bag(directory: Path, custom_data: Mapping[str, str], profile: str) -> Iterator[BagWriter]:
+    """A bag that is gone again after Ctrl-C: what was copied until then would pass for all that could be saved."""
+    writer = BagWriter(directory, None, custom_data=custom_data, profile=profile)
+    try:
+        with writer:
+            yield writer
+    except KeyboardInterrupt:
+        writer.path.unlink()
+        if writer.path != directory:
+            (directory / metadata.FILE_NAME).unlink(missing_ok=True)
+            directory.rmdir()
+        raise
 
 
 def _begin(files: list[BagFile], given: str | Path) -> tuple[str, dict[str, Any]]:
@@ -107,7 +121,7 @@ class _Copy:
     """What is copied to a new bag; `packed`: messages are compressed one by one, and are unpacked."""
 
     def __init__(self, writer: BagWriter, packed: bool) -> None:
-        self._writer, self._unpack = writer, metadata.unpack_message if packed else bytes
+        self._writer, self._unpack = writer, metadata.unpack if packed else bytes
         self._topics: dict[str, tuple[int, Topic]] = {}  # channel of the new bag, by name
         self.lost: Counter[str] = Counter()  # by why it is lost
 
@@ -120,7 +134,7 @@ class _Copy:
             if isinstance(record, Message):
                 try:
                     data = self._unpack(record.data)
-                except (ZstdError, MemoryError):
+                except ValueError:
                     self.lost["messages cannot be unpacked"] += 1
                     continue
                 if target := targets.get(record.channel_id, 0):
