@@ -160,7 +160,7 @@ def _check_decisions(
     assert log.heard is not None
     count, delays = frames.check_received(log.heard, len(log))
     result.count("frames taken in as they were delivered", count)
-    delivery = DeliveryCounts(log.agents, len(log), int(log.sent.sum()), int(log.received.sum()), count)
+    delivery = DeliveryCounts(log.agents, len(log), int(log.sent.sum()), int(log.reached.sum()), count)
     result.unheard = delivery.problem(summary.get("not_taken_in"))
     result.skipped["motion"] = "it depends on when in a slot each message reached each process"
     if log.config.swarm.auth and not has_key:
