@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import PATIENCE_S, FlightProcess, process_with, start_flight, summary_of
+from fly_helpers import PATIENCE_S, FlightProcess, process_with, start_flight, summary_of, verified
 
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import decode_extended
@@ -197,6 +197,7 @@ def test_an_agent_may_come_late(tmp_path: Path) -> None:
     assert (summary["lost_agents"], summary["returned_agents"]) == ([], [3])
     assert_told_alike(summary, flight.out)
     assert "other run" not in summary["not_taken_in"]  # what it has heard before it was called
+    assert verified(flight.out).checked["decisions made again"] > 3 * 50  # of those that were there from the start
     found = reports(flight.out, 3)
     assert found[0].slot > 50
     scenario = make_scenario(SwarmConfig(agents=4, moving=4, scenario="waypoints", axis_x_m=6.0, stops=50))
