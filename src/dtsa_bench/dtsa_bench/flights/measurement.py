@@ -103,8 +103,8 @@ class FlightMeasurement(ChannelObserver):
         self._lengths = [len(frames[sender]) for sender in verdict.senders]
         self.scenario.advance(slot, self.tables)  # what all know about each other's goals
         mask = verdict.mask(self._agents)
-        # Frames reach no agent that is not there.
-        self.hearing.add_slot(len(verdict.senders), np.delete(mask, [agent - 1 for agent in self.metrics.lost], axis=1))
+        gone = [agent - 1 for agent in self.metrics.lost]  # no frame reaches them
+        self.hearing.add_slot(len(verdict.senders), np.delete(mask, gone, axis=1) if gone else mask)
         heard = [(slot, frames[sender], mask[row]) for row, sender in enumerate(verdict.senders) if mask[row].any()]
         if answers.receipts is not None:  # in real time the receivers themselves know best
             heard = [(taken.slot, taken.data, taken.mask) for taken in answers.receipts.values()]
