@@ -144,7 +144,7 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
         if RECOVERED_FROM in bag.custom_data:
             log.notes.append("This bag was recovered: its recorder was killed or its file was damaged.")
         return log if merged is None else split_log(log, merged["common_slot"])
-    except (ValueError, IndexError, TypeError, MemoryError) as error:
+    except (ValueError, IndexError, TypeError, AttributeError, MemoryError) as error:  # fields of a foreign type
         raise UnusableBag(bag.given, f"its slot records do not fit together ({error})") from None
 
 
