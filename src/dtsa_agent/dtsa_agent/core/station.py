@@ -129,6 +129,11 @@ def check_joinable(policy: str) -> None:
         raise ConfigError("policy", policy, f"{', '.join(joinable)}, to come into a flight that is under way")
 
 
+def longest_wait_ns(config: SwarmConfig) -> int:
+    """How long after the start of its own slot an agent may wait for the frame of the one before, ns."""
+    return 0 if config.policy_row.may_join else min(config.slot_ns * lib.DTSA_MAX_WAIT // 1000, lib.DTSA_MAX_WAIT_NS)
+
+
 def parse_quorum(text: object) -> tuple[int, float]:
     """Number and share that a quorum's text means, for ``dtsa_station_settings``; ConfigError: none."""
     match = re.fullmatch(r"([0-9]+)|([0-9]+(?:\.[0-9]+)?)%", text) if isinstance(text, str) else None

@@ -151,8 +151,8 @@ class AgentsNode(ABC):
             if self.run_id and phase == Slot.PREPARE:
                 self._following = run
                 self._publish_counts(left_over=True)
-            detail = f"slot message of run {run_text(run)}; this one is {run_text(self.run_id)}"
-            raise BadMessage(checks.OTHER_RUN, detail)
+            reason = checks.OTHER_RUN if self.run_id or phase != Slot.RUN else checks.NOT_CALLED
+            raise BadMessage(reason, f"slot message of run {run_text(run)}; this one is {run_text(self.run_id)}")
         caller = self._callers.get(run) or self._add_caller(run, message.data, sender)
         if phase == Slot.END:
             if not caller.call.ended_by(message.data):

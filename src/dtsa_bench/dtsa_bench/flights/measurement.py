@@ -103,7 +103,8 @@ class FlightMeasurement(ChannelObserver):
         self._lengths = [len(frames[sender]) for sender in verdict.senders]
         self.scenario.advance(slot, self.tables)  # what all know about each other's goals
         mask = verdict.mask(self._agents)
-        self.hearing.add_slot(len(verdict.senders), mask)
+        gone = [agent - 1 for agent in self.metrics.lost]  # no frame reaches them
+        self.hearing.add_slot(len(verdict.senders), np.delete(mask, gone, axis=1) if gone else mask)
         heard = [(slot, frames[sender], mask[row]) for row, sender in enumerate(verdict.senders) if mask[row].any()]
         if answers.receipts is not None:  # in real time the receivers themselves know best
             heard = [(taken.slot, taken.data, taken.mask) for taken in answers.receipts.values()]
@@ -132,20 +133,26 @@ class _Sends(EvenlySpread[float]):
 
     def __init__(self) -> None:
         super().__init__(_KEPT)
-        self.on_time = 0
+        self.on_time = self.as_due = 0
         self.largest = 0.0  # the one farthest away
 
-    def append(self, value: float) -> None:
-        super().append(value)
+    def add(self, value: float, wait_ns: int) -> None:
+        """Receive one; ``wait_ns``: how long the agent may have waited for another frame by the rules."""
+        self.append(value)
         self.on_time += abs(value) <= ON_TIME_NS
+        self.as_due += -ON_TIME_NS <= value <= ON_TIME_NS + wait_ns
         self.largest = max(self.largest, value, key=abs)
 
 
 class TimingStatistics(ChannelObserver):
-    """Collects when slots start, frames leave, and receivers have them, as they say themselves, and sums it up."""
+    """Collects when slots start, frames leave, and receivers have them, as they say themselves, and sums it up.
 
-    def __init__(self, agents: int) -> None:
-        self._agents = agents
+    :param wait_ns: how long after the start of its slot an agent may wait for another frame by the rules.
+    """
+
+    def __init__(self, agents: int, wait_ns: int = 0) -> None:
+        self._agents, self._wait_ns = agents, wait_ns
+        self._unsent = 0  # frames that were made too late to be sent
         self._spreads = 0  # slots of which two agents told their start
         self._spread_sum = self._spread_max = 0.0  # ns, over those
         self._last_spreads: deque[float] = deque(maxlen=_END)  # ns
@@ -157,8 +164,13 @@ class TimingStatistics(ChannelObserver):
             receivers = np.flatnonzero(taken.mask)
             self._delays.add_many(taken.at_ns[receivers] - taken.arrival_ns, receivers)
 
-    def add_slot(self, answered: NDArray[np.bool_], sent: NDArray[np.bool_], offset_ns: NDArray[np.int64]) -> None:
-        """Receive all that agents report of a slot, (N,): whether they do, whether they sent, when either began."""
+    def add_slot(
+        self, answered: NDArray[np.bool_], sent: NDArray[np.bool_], offset_ns: NDArray[np.int64],
+        chosen: NDArray[np.uint16],
+    ) -> None:  # fmt: skip
+        """Receive what agents report of a slot, (N,): whether they do, whether they sent, when either began, whose turn
+        each took it for."""
+        self._unsent += int(np.count_nonzero(answered & ~sent & (chosen == np.arange(1, self._agents + 1))))
         starts = np.sort(offset_ns[answered & ~sent])
         count = len(starts)
         if count > 1:
@@ -169,7 +181,13 @@ class TimingStatistics(ChannelObserver):
             self._last_spreads.append(spread)
         for index in np.flatnonzero(sent).tolist() if count else ():
             median = (starts[(count - 1) // 2] + starts[count // 2]) / 2
-            self._away.setdefault(index + 1, _Sends()).append(float(offset_ns[index] - median))
+            self._away.setdefault(index + 1, _Sends()).add(float(offset_ns[index] - median), self._wait_ns)
+
+    @property
+    def as_due_share(self) -> float:
+        """Share of the frames, those that were not sent among them, that left on time or after a wait by the rules."""
+        made = self._unsent + sum(sends.count for sends in self._away.values())
+        return sum(sends.as_due for sends in self._away.values()) / made if made else 1.0
 
     def summary(self) -> dict[str, Any]:
         """The results; None where nothing was reported.
@@ -219,11 +237,11 @@ def tight(channel: RealtimeChannel) -> str:
     )
 
 
-def warning(channel: RealtimeChannel, summary: dict[str, Any]) -> str | None:
+def warning(channel: RealtimeChannel, as_due_share: float, summary: dict[str, Any]) -> str | None:
     """Why figures of a flight describe the machine rather than the protocol; None if they do not."""
     frames = max(1, channel.pace.lag.count() + channel.air.late)
     entries = max(1, summary["slots"]["total"] * channel.agents)
-    lag, on_time = summary["channel_lag_p99_ms"], summary["sends_on_time_share"]
+    lag = summary["channel_lag_p99_ms"]
     longest = max((end - begin for begin, end in summary["stalls"]), default=0.0)
     found = [
         text
@@ -234,7 +252,7 @@ def warning(channel: RealtimeChannel, summary: dict[str, Any]) -> str | None:
             (f"the channel's lag is {lag or 0.0:.1f} ms (p99)", lag is not None and lag * 1e6 > _LAG * channel.slot_ns),
             (f"{channel.air.late} frames came too late", channel.air.late > _LATE * frames),
             (f"{channel.accounts.missed} entries of reports came too late", channel.accounts.missed > _LATE * entries),
-            (f"{on_time or 0.0:.1%} of the frames left on time", on_time is not None and on_time < _ON_TIME),
+            (f"{as_due_share:.1%} of the frames left on time", as_due_share < _ON_TIME),
         )
         if wrong
     ]

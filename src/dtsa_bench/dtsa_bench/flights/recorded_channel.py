@@ -15,6 +15,7 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.config import agreed_settings
 from dtsa_agent.core.settings.declaration import Setting, settings_of
+from dtsa_agent.core.station import longest_wait_ns
 from dtsa_agent.keys import check_key
 from dtsa_agent.priority import PrioritySettings, set_realtime
 from dtsa_agent.ros.common import names
@@ -66,7 +67,7 @@ class RecordedFlight:
             if run.mode == LOCKSTEP
             else RealtimeChannel(node, model, steps, over=over, **limits)
         )
-        self._timing = TimingStatistics(run.swarm.agents)
+        self._timing = TimingStatistics(run.swarm.agents, longest_wait_ns(run.swarm))
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
             FlightRecorder(directory / BAG, run, self.scenario, self.channel, self._timing),
@@ -97,7 +98,7 @@ class RecordedFlight:
                 **channel_summary(channel),
                 **self._timing.summary(),
             }
-            result["warning"] = warning(channel, result)
+            result["warning"] = warning(channel, self._timing.as_due_share, result)
         return result
 
     def write_results(self, pictures: bool = True, **more: Any) -> dict[str, Any]:

@@ -121,7 +121,7 @@ class FlightRecorder(ChannelObserver):
     def _write_accounts(self, closed: int, at_end: bool = False) -> None:
         """Write the records of slots in real time for which nothing is waited for any more."""
         for slot, account in self._accounts.pop(closed, at_end) if self._accounts is not None else ():
-            self._timing.add_slot(account.answered, account.sent, account.offset_ns)
+            self._timing.add_slot(account.answered, account.sent, account.offset_ns, account.chosen)
             self._write_record(slot, account.fields(slot * self._slot_ns))
 
     def _write_record(self, slot: int, fields: dict[str, Any]) -> None:

@@ -91,6 +91,7 @@ class FlightArrays:
     sent_ns: NDArray[np.int64] | None = None  # (S, N) ns, with clocks of their own: start of transmissions, likewise
     presence: NDArray[np.uint8] | None = None  # (S, N) PRESENT or LEAVING, UNRECORDED or NEW added; None: all PRESENT
     heard: ReceivedFrames | None = None  # in flights of agents with clocks of their own
+    absent: Mask | None = None  # (S, N) agents that had not come yet, had fallen silent or left; None: not known
     first_slot: int = 0  # number that the agents gave slot 0
     merged: dict[str, Any] | None = None  # what the log was merged from; None: it was recorded as one
     whole: FlightArrays | None = None  # of a merged one: with the slots before the first that all counted alike
@@ -199,6 +200,11 @@ class FlightArrays:
         return [int(end) for end in np.searchsorted(rows, np.arange(len(self) + 1))]
 
     @cached_property
+    def reached(self) -> Mask:
+        """(F, N) `received`, without agents that were not there."""
+        return self.received if self.absent is None else self.received & ~self.absent[self.sent_frames.row]
+
+    @cached_property
     def known_receivers(self) -> NDArray[np.int64]:
         """(F,) other agents of which is known whether they received a frame."""
         frames = self.sent_frames
@@ -220,8 +226,8 @@ class FlightArrays:
             velocity[:, :-1] = before + (velocity[:, -1:] - before) * part  # only those at slots' starts are recorded
         times = (np.arange(count)[:, None] - 1) * self.slot_ns + (np.arange(steps) + 1) * self.slot_ns // steps
         flown = times >= 0
-        if self.merged is None:
-            flown &= np.isfinite(self.track).all(axis=(2, 3))
+        if self.merged is None:  # any agent was there
+            flown &= np.isfinite(self.track).all(axis=2).any(axis=2)
         else:
             flown &= times <= (count - 1 if self.has_end else count - 2) * self.slot_ns
         return times[flown] / 1e9, self.track[flown], velocity[flown]

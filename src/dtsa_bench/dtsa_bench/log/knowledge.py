@@ -120,6 +120,7 @@ class _WholeReplay(TableReplay):
         everyone = log.heard is not None or bool(log.lost.any()) or bool(log.collided.any())
         super().__init__(log.config, log.scenario, everyone)
         self._log, self._metrics = log, FlightMetrics(log.config, log.scenario)
+        self._absent = np.zeros(log.agents, np.bool_)  # in the slot that is replayed
 
     @property
     def results(self) -> dict[str, Any]:
@@ -133,10 +134,11 @@ class _WholeReplay(TableReplay):
 
     def __iter__(self) -> Iterator[KnownSlot]:
         log, metrics, sent = self._log, self._metrics, self._log.sent_frames
-        track, moving = _filled(log.track), log.moving
+        track, digest = self._filled_track(), np.zeros(log.agents, np.uint32)
         for row in range(len(log)):
+            self._note_absent(row)
             frames = slice(log.sent_ends[row], log.sent_ends[row + 1])
-            self.delivery.add_slot(frames.stop - frames.start, sent.received[frames])
+            self.delivery.add_slot(frames.stop - frames.start, log.reached[frames])
             if log.heard is None:
                 slots = [row] * (frames.stop - frames.start)
                 heard = zip(slots, sent.data[frames], sent.received[frames], strict=True)
@@ -145,21 +147,34 @@ class _WholeReplay(TableReplay):
                 part = slice(log.heard_ends[row], log.heard_ends[row + 1])
                 columns = log.heard.slot[part].tolist(), log.heard.data[part], log.heard.receivers[part]
                 self.step(row, zip(*columns, strict=True))
-            metrics.compare_tables(row, log.digest[row], log.chosen[row])
+            digest = np.where(log.known[row], log.digest[row], digest)
+            metrics.compare_tables(row, digest, log.chosen[row])
             outcome = int(log.outcome[row])
             sizes = [len(data) for data in sent.data[frames]]
             metrics.update(row, track[row + 1], self.tables, outcome if outcome < UNKNOWN else 0, sizes)
             self.estimate(row + 1, track[row + 1, -1])
-            yield KnownSlot(row, row, self.tables, track[row + 1, -1], moving, row >= log.agents)
+            yield KnownSlot(row, row, self.tables, track[row + 1, -1], metrics.counted, row >= log.agents)
 
+    def _note_absent(self, row: int) -> None:
+        """Agents come and go before a slot, as in flight."""
+        if self._log.absent is None:
+            return
+        before, self._absent = self._absent, self._log.absent[row]
+        for column in np.flatnonzero(self._absent & ~before).tolist():
+            self._metrics.lose(column + 1)
+            if not self._log.absent[row:, column].all():
+                self._metrics.awaited.add(column + 1)
+        for column in np.flatnonzero(before & ~self._absent).tolist():
+            self._metrics.regain(column + 1)
 
-def _filled(track: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions, with the last known one where an agent has not told: its vehicle is taken to stay."""
-    lost = np.isnan(track).any(axis=(1, 2))  # (S + 1, N)
-    if not lost.any():
-        return track
-    filled = track.copy()
-    for row in np.flatnonzero(lost.any(axis=1)).tolist():
-        gone = lost[row]
-        filled[row][:, :, gone] = filled[row - 1, -1][:, gone] if row else 0.0
-    return filled
+    def _filled_track(self) -> NDArray[np.float64]:
+        """Positions, with the last known one where an agent has not told: its vehicle is taken to stay."""
+        track = self._log.track
+        unknown = np.isnan(track).any(axis=(1, 2))  # (S + 1, N)
+        if not unknown.any():
+            return track
+        filled, last = track.copy(), self.scenario.start
+        for row in range(len(track)):
+            filled[row][:, :, unknown[row]] = last[:, unknown[row]]
+            last = filled[row, -1]
+        return filled

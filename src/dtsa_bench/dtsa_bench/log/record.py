@@ -25,6 +25,7 @@ from .arrays import DECIDED, PRESENT, UNKNOWN, VECTORS, ReceivedFrames, empty_ar
 from .flight_log import FlightLog
 
 SLOT_RECORD, TYPE = f"{names.SWARM}/{names.SLOT_RECORD}", "dtsa_msgs/msg/SlotRecord"
+_STATUS = f"{names.SWARM}/{names.STATUS}"
 CONFIGURATION = "dtsa_msgs/msg/Configuration"
 _HEADER = "std_msgs/msg/Header"
 FORMAT, FORMAT_KEY = "2", "format"  # of bags, and its name in custom data
@@ -141,11 +142,28 @@ def build_log(bag: Bag, records: Iterable[Any]) -> FlightLog:
         is_whole = merged is None and not {AGENT, SNIFFER} & set(bag.custom_data)
         log = make_log(found, agents, slot_ns, is_whole, _name(bag), settings)
         log.file, log.version, log.merged = bag.path, bag.custom_data.get("version", ""), merged
+        if is_whole and log.heard is not None and not log.known.all():
+            log.absent = _absent_agents(bag, log)
         if RECOVERED_FROM in bag.custom_data:
             log.notes.append("This bag was recovered: its recorder was killed or its file was damaged.")
         return log if merged is None else split_log(log, merged["common_slot"])
-    except (ValueError, IndexError, TypeError, MemoryError) as error:
+    except (ValueError, IndexError, TypeError, AttributeError, MemoryError) as error:  # fields of a foreign type
         raise UnusableBag(bag.given, f"its slot records do not fit together ({error})") from None
+
+
+def _absent_agents(bag: Bag, log: FlightLog) -> NDArray[np.bool_]:
+    """(S, N) agents that were not there, as the channel has told in flight.
+
+    :raises ValueError: for ids of no agents.
+    """
+    absent = np.zeros_like(log.known)
+    for _, status in bag.typed([_STATUS]):
+        if status.phase == status.FLYING:
+            if len(status.lost) and not 0 < status.lost.min() <= status.lost.max() <= log.agents:
+                raise ValueError(f"lost agents {status.lost.tolist()}")
+            absent[status.slot :] = False
+            absent[status.slot :, status.lost.astype(np.int64) - 1] = True
+    return absent
 
 
 _GAVE_UP = "agents_that_gave_up_a_time"  # bags of earlier versions have none

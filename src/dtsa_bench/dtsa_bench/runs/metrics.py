@@ -136,6 +136,8 @@ class FlightMetrics:
             track = track.copy()
             for agent in self.lost:  # its vehicle hovers where it was last known, or nobody knows
                 track[:, :, agent - 1] = self._last[:, agent - 1]
+                if tables is not None:  # what it knew last does not grow old
+                    tables.in_ap[tables.observer == agent - 1] = 0
             self.kernel.waits = not self._others_arrived(track[-1])
         if track is not self._seen[0] or tables is not self._seen[1]:  # mostly they are the same again
             self.use_arrays(track, tables)

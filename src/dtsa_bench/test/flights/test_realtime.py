@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fly_helpers import fly, readable, start_flight, summary_of, verified
-from waiting import wait_for
+from fly_helpers import fly, readable, verified
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -40,6 +37,7 @@ def test_with_alignment_slots_stay_together_and_without_frames_collide(tmp_path:
     assert apart["clock_spread_end_ms"] == pytest.approx(max(gained) - min(gained), abs=0.5)
     assert apart["clock_spread_end_ms"] > 3.0
     assert together["clock_spread_end_ms"] < 1.0
+    assert together["slots"]["success"] > together["slots"]["total"] // 2
     met_apart, met_together = (verified(path).safety["frames_collided"] for path in (tmp_path / "apart", aligned))
     assert met_apart > 20
     assert met_together < met_apart / 4  # a busy machine may make a frame late now and then; clocks do not
@@ -47,9 +45,12 @@ def test_with_alignment_slots_stay_together_and_without_frames_collide(tmp_path:
 
 def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path: Path) -> None:
     words = ("--agents", "3", "--moving", "2", "--policy", "tdma", "--processes", "1", "--mode", "realtime")
-    more = ("--no-align", "--clock-offset-ns", "4000000", "--timeout-s", "1", "--no-picture")
-    fly(tmp_path / "fast", *words, *more)
+    more = ("--no-align", "--clock-offset-ns", "4000000", "--clock-jitter-ns", "20000", "--timeout-s", "1")
+    summary = fly(tmp_path / "fast", *words, *more, "--no-picture")
+    assert (summary["mode"], summary["end"], summary["lost_agents"]) == ("realtime", "timed out", [])
+    assert summary["realtime_factor"] == pytest.approx(1.0, abs=0.2)
     log = load_log(tmp_path / "fast")
+    assert len(set(log.offset_ns[0])) == 3  # three clocks, none like another
     assert (log.offset_ns[log.sent] < 0).any()
     assert readable(tmp_path / "fast")
 
@@ -92,45 +93,3 @@ def test_seventy_agents_lose_no_message(tmp_path: Path) -> None:
         for agent in odd:
             odd[agent] = odd[agent] + 1 if views[slot][agent] != usual else 0
             assert odd[agent] < agents - 5, f"cf{agent} has missed a frame"
-
-
-@pytest.mark.alone
-@pytest.mark.realtime
-def test_in_real_time_agents_keep_their_own_clocks(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    clocks = ("--clock-offset-ns", "300000", "--clock-drift-ppm", "50", "--clock-jitter-ns", "20000")
-    words = ("--agents", "4", "--policy", "tdma", "--processes", "2", "--mode", "realtime", "--tail-s", "0.1")
-    summary = fly(out, *words, *clocks, "--no-picture")
-    assert summary["mode"] == "realtime"
-    assert summary["end"] == "completed"
-    assert summary["lost_agents"] == []
-    assert summary["slots"]["success"] > summary["slots"]["total"] // 2
-    assert summary["realtime_factor"] == pytest.approx(1.0, abs=0.2)
-    with Bag(out / "bag") as bag:
-        sent = [message for _, message in bag.typed([SLOT_RECORD])]
-    first = {
-        int(agent): int(offset)
-        for message in sent[:2]
-        for agent, offset in zip(message.agent, message.offset_ns, strict=True)
-    }
-    assert len(set(first.values())) == 4  # four clocks, none like another
-    readable(out)
-
-
-@pytest.mark.alone
-@pytest.mark.realtime
-def test_in_real_time_the_others_fly_on_when_one_is_killed(tmp_path: Path) -> None:
-    words = ("--agents", "5", "--moving", "4", "--policy", "lease", "--mode", "realtime", "--tail-s", "0.2")
-    with start_flight(tmp_path, *words, "--no-picture", begun=False) as flight:
-        wait_for(lambda: flight.bag_bytes() > 20_000)  # it is under way
-        victim = flight.pid_of(3)
-        os.kill(victim, signal.SIGKILL)
-        flight.assert_ends(0, f"cf3 (process {victim}) was killed by SIGKILL; the others fly on")
-    summary = summary_of(flight.out)
-    assert summary["lost_agents"] == [3]
-    assert summary["end"] == "completed"
-    assert summary["collided"] is False
-    log = load_log(flight.out)
-    assert len(log) == summary["slots"]["total"]
-    flew, others = np.flatnonzero(log.known[:, 2]), np.flatnonzero(log.known[:, 0] & ~log.known[:, 2])
-    assert flew[-1] + 100 < others[-1]  # it flew, and long after it the others did

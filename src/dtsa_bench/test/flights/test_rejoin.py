@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import PATIENCE_S, FlightProcess, process_with, start_flight, summary_of
+from fly_helpers import PATIENCE_S, FlightProcess, process_with, start_flight, summary_of, verified
 
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import decode_extended
@@ -52,6 +52,17 @@ class Report:
     place: np.ndarray  # (3,) m
     frame: bytes
     heard: int = 0  # by how many
+
+
+def assert_told_alike(summary: dict[str, Any], out: Path) -> None:
+    """What a bag says of a flight is what the flight has said of itself, whoever came, went and came back."""
+    told = load_log(out).summary
+    for name in ("end", "completed", "collided", "lost_agents", "min_distance_pair", "wakings"):
+        assert told[name] == summary[name], name
+    for name in ("min_distance_m", "age_mean_slots", "agreement_share", "waking_age_mean_slots"):
+        assert told[name] == pytest.approx(summary[name], rel=0.1), name
+    receptions = summary["receptions"]  # the last ones may not have been reported
+    assert receptions["taken_in"] <= receptions["delivered"] < receptions["taken_in"] + 30
 
 
 def reports(out: Path, agent: int) -> list[Report]:
@@ -99,8 +110,10 @@ def test_a_killed_process_comes_back_and_its_agents_are_heard_again(tmp_path, ar
     assert "was killed by SIGKILL; the others fly on" in flight.stderr()
     assert "has not been heard of" not in flight.stderr()
     assert (summary["lost_agents"], summary["returned_agents"], summary["collided"]) == ([], agents, False)
+    assert_told_alike(summary, flight.out)
     for agent in agents:
         before, after = before_and_after(flight.out, agent)
+        assert summary["age_max_slots"] < after[0].slot - before[-1].slot  # nobody's knowledge grew old meanwhile
         # Its program started again, its vehicle went on hovering where it was.
         assert after[0].place == pytest.approx(before[-1].place, abs=0.1)  # the last report may not have come in yet
         assert sum(report.heard > 0 for report in after) > 5
@@ -182,6 +195,9 @@ def test_an_agent_may_come_late(tmp_path: Path) -> None:
         summary = land(flight, 300)
     assert "has not been heard of" not in flight.stderr()
     assert (summary["lost_agents"], summary["returned_agents"]) == ([], [3])
+    assert_told_alike(summary, flight.out)
+    assert "other run" not in summary["not_taken_in"]  # what it has heard before it was called
+    assert verified(flight.out).checked["decisions made again"] > 3 * 50  # of those that were there from the start
     found = reports(flight.out, 3)
     assert found[0].slot > 50
     scenario = make_scenario(SwarmConfig(agents=4, moving=4, scenario="waypoints", axis_x_m=6.0, stops=50))

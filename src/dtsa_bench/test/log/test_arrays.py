@@ -100,10 +100,18 @@ def test_each_receiver_counts_once_and_a_sender_not_at_all() -> None:
 
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:
-    statistics = TimingStatistics(3)
-    for offsets_ns, sends in (([0, 400_000, 3_200_000], [0, 0, 1]), ([100_000, 0, 100_000], [0, 1, 0])):
-        statistics.add_slot(np.ones(3, np.bool_), np.array(sends, np.bool_), np.array(offsets_ns))  # 3 ms late
+    patient, statistics = TimingStatistics(3, wait_ns=3_000_000), TimingStatistics(3)
+    assert statistics.as_due_share == 1.0
+    for offsets_ns, sends, chosen in (
+        ([0, 400_000, 3_200_000], [0, 0, 1], [3, 3, 3]), ([100_000, 0, 100_000], [0, 1, 0], [2, 2, 2]),  # 3 ms late
+    ):  # fmt: skip
+        for each in (patient, statistics):
+            each.add_slot(np.ones(3, np.bool_), np.array(sends, np.bool_), np.array(offsets_ns), np.array(chosen))
     summary = statistics.summary()
+    assert (patient.as_due_share, statistics.as_due_share) == (1.0, 0.5)
+    for answers in (True, False):  # a frame that was made too late to be sent; nobody knows of another
+        patient.add_slot(np.full(3, answers), np.zeros(3, np.bool_), np.zeros(3, np.int64), np.array([1, 1, 1]))
+    assert patient.as_due_share == pytest.approx(2 / 3)
     assert summary["clock_spread_max_ms"] == pytest.approx(0.4)
     assert summary["clock_spread_mean_ms"] == pytest.approx(0.2)
     assert summary["clock_spread_end_ms"] == pytest.approx(0.4)

@@ -22,6 +22,10 @@ extern "C" {
 /* Of a slot, in thousandths, between a frame that left late and the next slot: clocks differ. */
 enum { DTSA_BETWEEN = 200 };
 
+/* If the policy needs equal tables, an agent waits for a frame until after the start of its own slot:
+ * thousandths of a slot, and ns, whichever is less. Sending late costs less than tables that differ. */
+enum { DTSA_MAX_WAIT = 300, DTSA_MAX_WAIT_NS = 3000000 };
+
 enum { DTSA_DATAGRAM_MAX = 512, DTSA_HEADER_MAX = 8, DTSA_NAMES_MAX = 4 };
 
 /* What carries the datagrams; the same for all stations of a swarm. A datagram is the header, how

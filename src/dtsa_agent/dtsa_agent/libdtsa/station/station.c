@@ -9,9 +9,6 @@
 /* In thousandths of a slot: an agent decides LEAD before the slot starts; if it still waits for the
  * present slot's frame, LATEST_LEAD before. */
 enum { LEAD = 700, LATEST_LEAD = 200 };
-/* If the policy needs equal tables, it waits for the frame until after the start: thousandths of a slot,
- * and ns, whichever is less. Sending late costs less than tables that differ. */
-enum { MAX_WAIT = 300, MAX_WAIT_NS = 3000000 };
 static const int64_t HALF_SECOND_NS = 500000000;
 
 static int64_t slot_share(int64_t slot_ns, int thousandths) { return slot_ns * thousandths / 1000; }
@@ -76,8 +73,9 @@ static void set_times(dtsa_station *s)
                                                       : INT64_MAX;
     s->patience_ns = larger(2 * mains, HALF_SECOND_NS);
     s->lead_ns = slot_share(slot, LEAD);
-    s->latest_lead_ns = c->equal_tables ? -smaller(slot_share(slot, MAX_WAIT), MAX_WAIT_NS)
-                                        : slot_share(slot, LATEST_LEAD);
+    s->latest_lead_ns = c->equal_tables
+                            ? -smaller(slot_share(slot, DTSA_MAX_WAIT), DTSA_MAX_WAIT_NS)
+                            : slot_share(slot, LATEST_LEAD);
     s->latest_send_ns =
         larger(slot - c->link.flight_ns - slot_share(slot, DTSA_BETWEEN), slot / 10);
     s->too_long_ns = dtsa_station_too_long(c);

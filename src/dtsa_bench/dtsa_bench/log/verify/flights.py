@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -158,20 +160,26 @@ def _check_decisions(
 ) -> None:
     """What agents took in had been delivered to them, and their decisions follow from it."""
     assert log.heard is not None
-    count, delays = frames.check_received(log.heard, len(log))
+    count, delays = frames.check_received(log.heard, len(log), log.reached)
     result.count("frames taken in as they were delivered", count)
-    delivery = DeliveryCounts(log.agents, len(log), int(log.sent.sum()), int(log.received.sum()), count)
+    delivery = DeliveryCounts(log.agents, len(log), int(log.sent.sum()), int(log.reached.sum()), count)
     result.unheard = delivery.problem(summary.get("not_taken_in"))
     result.skipped["motion"] = "it depends on when in a slot each message reached each process"
     if log.config.swarm.auth and not has_key:
         result.skipped["decisions"] = f"no key in {VARIABLE}"
     else:
-        replay = AgentReplay(log, range(1, log.agents + 1), tags=log.config.swarm.auth)
-        for row in np.flatnonzero(np.logical_and.accumulate(log.known.all(axis=1))).tolist():
-            replay.step(row)  # up to the first slot that an agent has not told of
-            if replay.differences:
-                raise _decision_mismatch(replay.differences[0], log)
-        result.count("decisions made again", replay.equal)
+        ends = np.logical_and.accumulate(log.known).sum(axis=0)  # (N,) up to the first slot that each has not told of
+        differences: list[DecisionDifference] = []
+        for end, ids in groupby(range(1, log.agents + 1), key=lambda agent: ends[agent - 1]):
+            replay = AgentReplay(log, list(ids), tags=log.config.swarm.auth)
+            for row in range(end):
+                replay.step(row)
+                if replay.differences:
+                    differences.append(replay.differences[0])
+                    break
+            result.count("decisions made again", replay.equal)
+        if differences:
+            raise _decision_mismatch(min(differences, key=attrgetter("slot", "agent")), log)
     result.safety |= delays | {"stalls": summary.get("stalls", [])}
 
 

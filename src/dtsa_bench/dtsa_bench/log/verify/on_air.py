@@ -129,10 +129,13 @@ class FramesOnAir:
                 at = int(self.slot[heard]), int(self.sender[heard])
                 raise Mismatch("received", f"without cf{agent}", f"cf{agent}", why, *at)
 
-    def check_received(self, heard: ReceivedFrames, slots: int) -> tuple[int, dict[str, Any]]:
+    def check_received(
+        self, heard: ReceivedFrames, slots: int, reached: NDArray[np.bool_]
+    ) -> tuple[int, dict[str, Any]]:
         """Whether agents took in what was delivered to them, once, and not before it was.
 
         :param slots: how many the log has.
+        :param reached: (F, N) receivers that were there.
         :returns: how many receivers and frames there were, and how long after their arrival frames were taken in, ms.
         :raises Mismatch: at the first entry for which that is not so.
         """
@@ -160,5 +163,5 @@ class FramesOnAir:
         delays_ms = (heard.time_ns[entry] - self.arrival_ns[frames]) / 1e6
         shares = np.quantile(delays_ms, (0.5, 0.99, 1.0), method="inverted_cdf").tolist() if len(entry) else [None] * 3
         names = "delivery_p50_ms", "delivery_p99_ms", "delivery_max_ms"
-        missing = int(self.received.sum()) - len(entry)
+        missing = int(reached.sum()) - int(reached[frames, column].sum())
         return len(entry), dict(zip(names, shares, strict=True)) | {"deliveries_not_taken_in": missing}
