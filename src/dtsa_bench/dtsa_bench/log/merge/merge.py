@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from dtsa_agent.air.port import flight_ns, frame_in
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.agent_bag import AgentBag
-from dtsa_bench.log.arrays import DECIDED, UNKNOWN, VECTORS, FlightArrays, ReceivedFrames, empty_arrays, split_log
+from dtsa_bench.log.arrays import (
+    DECIDED,
+    UNKNOWN,
+    VECTORS,
+    FlightArrays,
+    ReceivedFrames,
+    empty_arrays,
+    is_sparse,
+    split_log,
+)
 from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.merged_flight import MergedReplay, check_rules, run_of
@@ -117,8 +126,10 @@ class Merge:
         refused: Counter[str] = sum((bag.refused for bag in processes.values()), Counter())
         lengths, here = [len(bag.slots) for bag in processes.values()], {agent for agent, _ in processes}
         heard = sum(len(bag.heard.row) for bag in processes.values())
-        delivery = counts_of_datagrams(len(here), max(lengths), len(self.sent), heard, refused)
-        double = [slot for slot, count in Counter(slot for slot, _ in self.sent).items() if count > 1]
+        sent = [(slot, one.process) for (slot, _), datagrams in self.sent.items() for one in datagrams]
+        delivery = counts_of_datagrams(len(here), max(lengths), len(sent), heard, refused)
+        senders = Counter(slot for slot, (_, number) in sent if number >= 0)  # others are slots of another time
+        double = [slot for slot, count in senders.items() if count > 1]
         after = sum(common is not None and slot >= common for slot in double)
         held = {process_name(process): bag.summary.get("held_slots") for process, bag in processes.items()}
         rules = check_rules(self.log, joined.unsent) if joined else RuleChecker(self.config)
@@ -128,7 +139,7 @@ class Merge:
             **self._about_bags(),
             "time_line": line.summary(),
             **self._starts.summary(),
-            "frames_sent": len(self.sent),
+            "frames_sent": len(sent),
             "slots_with_two_senders": after,
             "slots_with_two_senders_before": len(double) - after,
             "frames_unsent": sum(len(replay.unsent) for replay in replays),
@@ -306,7 +317,8 @@ def _join(
     config = next(iter(processes.values())).swarm
     first = min(bag.log.first_slot for bag in processes.values())
     last = max(bag.log.first_slot + len(bag.log) for bag in processes.values()) - 1
-    if last - first >= 2 * len(np.unique(np.concatenate([bag.slots for bag in processes.values()]))) + 1000:
+    known = np.unique(np.concatenate([bag.slots for bag in processes.values()]))
+    if is_sparse(last - first, len(known), config.agents, config.steps):
         raise BagError(f"no agent tells of most of the slots {first} to {last}: no flight to record")
     arrays = empty_arrays(last - first + 1, config.agents, config.steps, config.slot_ns)
     arrays["start_ns"] += first * config.slot_ns
