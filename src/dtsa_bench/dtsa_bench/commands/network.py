@@ -175,9 +175,9 @@ frames: then a lease that it does not know looks like a broken rule."""
             sniffer.run(stop, duration)
         summary = sniffer.summary()
         text = json.dumps(summary, indent=2) + "\n"
+        print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
         if directory is not None:
             (directory / "summary.json").write_text(text, encoding="utf-8")
-        print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
         if sniffer.bag is not None and sniffer.bag.failure:
             raise BagError(sniffer.bag.failure)
         return 1 if summary["rules_broken"] else 0
