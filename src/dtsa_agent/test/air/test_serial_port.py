@@ -14,11 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from waiting import wait_for
 
+from dtsa_agent.air.driver import AgentVehicle, LiveAgent
 from dtsa_agent.air.port import ReceivedDatagram, check_fits, flight_ns, shortest_slot_ns
 from dtsa_agent.air.serial_modems import LONGEST, MODEMS, OVERHEAD, lora_ns
 from dtsa_agent.air.serial_port import LineReader, SerialPort, to_line
-from dtsa_agent.air.settings import SerialSettings
+from dtsa_agent.air.settings import AgentSettings, SerialSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.stop import Stop
 
 DATAGRAMS = st.binary(min_size=1, max_size=LONGEST)
 
@@ -147,6 +149,21 @@ def line(tmp_path: Path) -> Iterator[Line]:
     made.unplug()
 
 
+class LateVehicle(AgentVehicle):
+    """Its odometry comes late; a hundred datagrams come with each question for it."""
+
+    ASKED = 5
+
+    def __init__(self, line: Line) -> None:
+        self._line, self.asked = line, 0
+
+    def is_ready(self) -> bool:
+        self.asked += 1
+        for _ in range(10):
+            os.write(self._line.master, 10 * to_line(b"x"))
+        return self.asked > self.ASKED
+
+
 def heard(port: SerialPort, count: int) -> list[ReceivedDatagram]:
     """What has arrived, when so much has."""
     found: list[ReceivedDatagram] = []
@@ -216,3 +233,12 @@ def test_a_line_that_carries_something_else_is_told_once(line: Line, content: by
         assert heard(port, 1)[0].data == b"still"
         assert len(said) == 1
         assert why in said[0]
+
+
+def test_what_comes_while_an_agent_waits_for_its_vehicle_is_not_lost_by_the_computer(line: Line) -> None:
+    config, ours = SwarmConfig(agents=2, policy="tdma", slot_ms=100.0), SerialSettings(device=str(line.path))
+    with SerialPort(ours) as port, Stop() as stop:
+        agent = LiveAgent(AgentSettings(id=1, duration_s=1.0), config, port, vehicle=(vehicle := LateVehicle(line)))
+        agent.run(stop)
+        assert vehicle.asked > LateVehicle.ASKED
+        assert port.counts()["dropped_by_computer"] == 0
