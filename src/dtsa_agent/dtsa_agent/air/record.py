@@ -121,6 +121,7 @@ class AgentReports:
         self.not_taken_in: Counter[str] = Counter()  # datagrams not accepted, by reason
         self._unsent: Counter[str] = Counter()  # own frames that the port has refused, by reason
         self._hovered = [0, 0]  # slots without a quorum, before it flew for the first time and since then
+        self._same_id = 0  # slots in which another agent sent as this one
         self._flew = False
         self._others = self._hears = 0  # agents that are present, and those heard of them, over all checks
         self._late, self._off = Delays(), Delays()  # frames sent, by how late they left; heard, by how far off
@@ -145,6 +146,7 @@ class AgentReports:
             self._flew = True
         elif hovers == HoverReason.NO_QUORUM:
             self._hovered[self._flew] += 1
+        self._same_id += hovers == HoverReason.SAME_ID
         if now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + _STATUS_NS
             self.status(station.status, now_ns)
@@ -236,7 +238,10 @@ class AgentReports:
         """
         used, ended = _processor_s(), self.ended_ns or time.monotonic_ns()
         unsent = self._unsent + Counter({TOO_LATE: max(0, status.unsent - self._unsent.total())})
-        never = self._hovered[0] and not self._flew
+        held, shared = self._hovered[0], self._same_id
+        never = f"never had its quorum, and hovered for {held} slots" if held else ""
+        if shared > held:
+            never = f"another agent sent as {self._id}, and it hovered for {shared} slots"
         return {
             "wall_time_s": (ended - self.began_ns) / 1e9,
             "slots": status.slots,
@@ -257,8 +262,8 @@ class AgentReports:
             "times_corrected": status.shifts,
             "alignments": status.alignments,
             "flight_time_error_us": status.flight_error_ns / 1e3,
-            "never_flew": f"never had its quorum, and hovered for {self._hovered[0]} slots" if never else "",
-            "held_at_start_slots": self._hovered[0],
+            "never_flew": "" if self._flew else never,
+            "held_at_start_slots": held,
             "held_slots": self._hovered[1],
             "slots_too_short": self._slots_too_short,
             "not_taken_in": dict(sorted((self.not_taken_in + Counter(refused_by_tables)).items())),

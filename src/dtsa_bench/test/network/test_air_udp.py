@@ -437,7 +437,9 @@ def test_a_second_agent_of_the_same_id_hovers_and_is_silent(tmp_path: Path) -> N
         wait_for(lambda: again.heard[1] > 5 and first.speed > 0.05)  # in one time, and not new
         second = start(1, "second.mcap")
         wait_for(lambda: "hovers: another agent sends as 1" in second.said)
-    assert second.agent.summary()["sent"] <= 1  # its first turn may come before it hears the other one
+    found = second.agent.summary()
+    assert found["sent"] <= 1  # its first turn may come before it hears the other one
+    assert found["never_flew"]
 
 
 def test_an_agent_needs_no_ros(tmp_path: Path) -> None:

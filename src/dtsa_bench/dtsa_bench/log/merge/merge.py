@@ -14,17 +14,7 @@ from numpy.typing import NDArray
 from dtsa_agent.air.port import flight_ns, frame_in
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.log.agent_bag import AgentBag
-from dtsa_bench.log.arrays import (
-    DECIDED,
-    UNKNOWN,
-    VECTORS,
-    FlightArrays,
-    ReceivedFrames,
-    empty_arrays,
-    is_sparse,
-    split_log,
-)
-from dtsa_bench.log.bag.errors import BagError
+from dtsa_bench.log.arrays import DECIDED, UNKNOWN, VECTORS, FlightArrays, ReceivedFrames, empty_arrays, split_log
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.merged_flight import MergedReplay, check_rules, run_of
 from dtsa_bench.log.rules import RuleChecker
@@ -71,8 +61,7 @@ class Merge:
     def log(self) -> FlightLog:
         """The flight as one log: slots and times of the common line; slot 0 is the first that all counted alike.
 
-        :raises ConfigError: if there is no such slot.
-        :raises BagError: if most slots are missing.
+        :raises ConfigError: if there is no such slot, or most slots are missing.
         """
         starts, clocks = self._starts, self.line.clocks
         if starts.common_slot is None and len(self.processes) == 1:  # there is nothing to compare the one clock with
@@ -312,15 +301,13 @@ def _join(
     :param common_slot: the first slot that all counted alike, slot 0 of the log.
     :param under_way_ns: from the order to send a frame to its arrival.
     :param about: what to know of the bags, as plain values.
-    :raises BagError: if most slots are missing.
+    :raises ConfigError: if most slots are missing.
     """
     config = next(iter(processes.values())).swarm
     first = min(bag.log.first_slot for bag in processes.values())
     last = max(bag.log.first_slot + len(bag.log) for bag in processes.values()) - 1
-    known = np.unique(np.concatenate([bag.slots for bag in processes.values()]))
-    if is_sparse(last - first, len(known), config.agents, config.steps):
-        raise BagError(f"no agent tells of most of the slots {first} to {last}: no flight to record")
-    arrays = empty_arrays(last - first + 1, config.agents, config.steps, config.slot_ns)
+    recorded = len(np.unique(np.concatenate([bag.slots for bag in processes.values()])))
+    arrays = empty_arrays(last - first + 1, recorded, config.agents, config.steps, config.slot_ns)
     arrays["start_ns"] += first * config.slot_ns
     arrays["recorded"][:] = True
     frames: dict[tuple[int, int], tuple[int, bytes]] = {}  # by row and sender: when, and what
