@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -43,8 +44,12 @@ def test_how_many_others_are_needed(text: str, by_others: dict[int, int]) -> Non
     assert {others: needed(text, others) for others in by_others} == by_others
 
 
-@pytest.mark.parametrize("text", ["", "all", "101%", "-1", "0.8", "1.5", "%", "8 %", "\u0663", "all-but-two"])
-def test_other_words_are_refused(text: str) -> None:
+def test_a_number_may_be_one() -> None:
+    assert AgentSettings.from_dict({"id": 1, "quorum": 3}) == AgentSettings(id=1, quorum="3")
+
+
+@pytest.mark.parametrize("text", ["", "all", "101%", "-1", "0.8", "1.5", "%", "8 %", "\u0663", "all-but-two", True])
+def test_other_words_are_refused(text: Any) -> None:
     with pytest.raises(ConfigError) as error:
         AgentSettings(id=1, quorum=text)
     assert error.value.field == "quorum"
