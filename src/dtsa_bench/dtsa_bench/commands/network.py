@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,7 @@ frames: then a lease that it does not know looks like a broken rule."""
         directory = None if args.out is None else new_directory(args.out)
         path = None if directory is None else directory / "sniffed.mcap"
 
-        with Stop() as stop, Sniffer(config, port, path, warn) as sniffer:
+        with Stop() as stop, closing(Sniffer(config, port, path, warn)) as sniffer:
             sniffer.run(stop, duration)
         summary = sniffer.summary()
         text = json.dumps(summary, indent=2) + "\n"

@@ -69,7 +69,7 @@ class Sniffer:
             select.select([self._listener], [], [], _PATIENCE_S)
             for datagram in self._listener.receive(_BURST):
                 self._receive(datagram.data, datagram.arrival_ns)
-        self._close_slots()
+        self._close_slots(max(self._slots, default=0))
 
     def _receive(self, data: bytes, arrival_ns: int) -> None:
         reason, sender, slot, *_ = self._datagrams.read(data)
@@ -86,13 +86,11 @@ class Sniffer:
         self.heard[sender] += 1
         self._accepted_ns = arrival_ns
         self._slots.setdefault(slot, {})[sender] = arrival_ns, frame_in(data, self._config)
-        for over in sorted(s for s in self._slots if s <= max(self._slots) - _WAITS):
-            self._close_slot(over)
-            self._judged = over
+        self._close_slots(max(self._slots) - _WAITS)
 
     def _start_again(self) -> None:
         """The swarm counts its slots anew: they are judged anew, and have a file of their own."""
-        self._close_slots()
+        self._close_slots(max(self._slots, default=0))
         self._judged, self._starts = -1, self._starts + 1
         self._rules.restart()
         if self.bag is None or self._path is None:
@@ -105,9 +103,10 @@ class Sniffer:
             except DtsaError as error:
                 self.bag.failure = str(error)
 
-    def _close_slots(self) -> None:
-        for slot in sorted(self._slots):
+    def _close_slots(self, last: int) -> None:
+        for slot in sorted(slot for slot in self._slots if slot <= last):
             self._close_slot(slot)
+            self._judged = slot
 
     def _close_slot(self, slot: int) -> None:
         """Check a slot, and record it: its time is that of the first frame that was heard in it."""
@@ -138,9 +137,3 @@ class Sniffer:
         self._listener.close()
         if self.bag is not None:
             self.bag.close()
-
-    def __enter__(self) -> Sniffer:
-        return self
-
-    def __exit__(self, *unused: object) -> None:
-        self.close()

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -461,7 +461,7 @@ def test_a_swarm_that_is_started_again_is_judged_and_recorded_anew(tmp_path: Pat
     helpers.need_multicast()
     config, udp = SwarmConfig(agents=2, policy="tdma"), UdpSettings(interface="lo", group=helpers.own_group())
     datagrams = StationSettings(config, link_of(config, udp.properties))
-    with Sniffer(config, udp, tmp_path / "sniffed.mcap") as sniffer, Stop() as stop:
+    with closing(Sniffer(config, udp, tmp_path / "sniffed.mcap")) as sniffer, Stop() as stop:
         begins = time.monotonic_ns()
         for starts_ns in (begins, begins + 60_000_000_000):
             for slot in range(5, 25):
