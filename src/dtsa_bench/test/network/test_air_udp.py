@@ -8,7 +8,6 @@ import json
 import resource
 import subprocess
 import sys
-import threading
 import time
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -253,20 +252,6 @@ def test_a_damaged_bag_without_room_for_a_copy_is_one_line_and_no_difference(fli
         )  # fmt: skip
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done
         assert str(tmp_path / "cf1.mcap") in done.stderr
-
-
-@pytest.mark.parametrize("words", [["agent", "--id", "1"], ["sniff"]])
-def test_what_came_of_a_flight_is_printed_even_if_it_cannot_be_written(words, tmp_path, capsys):
-    helpers.need_multicast()
-    more = ["--agents", "2", "--interface", "lo", "--group", helpers.own_group(), "--no-seal", "--duration-s", "1"]
-    out = tmp_path / "out"
-    blocks = threading.Thread(target=lambda: (wait_for(out.is_dir), (out / "summary.json").mkdir()))
-    blocks.start()
-    assert main([*words, *more, "--out", str(out), "--json"]) == 1
-    blocks.join()
-    said = capsys.readouterr()
-    assert json.loads(said.out)
-    assert str(out / "summary.json") in said.err
 
 
 def test_a_bag_cut_off_is_read_up_to_there(flight: SimpleNamespace, tmp_path: Path) -> None:
