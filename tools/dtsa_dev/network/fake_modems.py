@@ -127,11 +127,6 @@ class FakeModems:
             self._plug(number - 1)
         self._wake()
 
-    def inject(self, number: int, data: bytes) -> None:
-        """Let other bytes come out of a modem."""
-        with self._lock:
-            self._write(number - 1, data)
-
     def __enter__(self) -> FakeModems:
         self._thread.start()
         return self

@@ -112,16 +112,18 @@ class LiveAgent:
     def _run(self, stop: Stop) -> None:
         began = self.reports.began_ns = time.monotonic_ns()
         end = began + round(self.own.duration_s * _SECOND) if self.own.duration_s else _NEVER
-        while not self._vehicle.is_ready():
+        clock, port, now = self.clock, self.port, began
+        while True:
+            for _ in range(_BURSTS):  # what came before it listens would have it begin in the past
+                if not port.receive(_BURST):
+                    break
+            if self._vehicle.is_ready():
+                break
             now = time.monotonic_ns()
             self.reports.state("waits for the vehicle's odometry", now)
             if stop or now >= end:
                 return
             time.sleep(_SIGNAL_POLL_S)
-        clock, port, now = self.clock, self.port, began
-        for _ in range(_BURSTS):  # what waits since before it listens would have it begin in the past
-            if not port.receive(_BURST):
-                break
         station = self.station = self._start()
         step = station.step
         local, deliver, descriptor = clock.local_ns, port.deliver, [port.fileno()]

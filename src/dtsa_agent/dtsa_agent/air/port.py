@@ -1,19 +1,8 @@
-"""What carries the datagrams of agents with clocks of their own: ports, their kinds by name, and the datagram itself.
+"""What carries the datagrams of agents with clocks of their own: ports, their kinds by name, and a datagram's header.
 
-| bytes | what |
-|---|---|
-| 0-1 | ``DT`` |
-| 2 | version, 1 |
-| 3 | 0 |
-| 4-7 | of the settings that all agents share, and of the session: 32 bits of their hash, little-endian |
-| 8-9 | how much later than its sender's slot the frame left, in 10 us, little-endian; the tag covers it |
-| 10-25 | four agents that its sender hears: id, 0: none; how much later than expected, in 10 us |
-| 26-.. | the frame, signed or not |
-
-Datagrams of other swarms on the same group are rejected by their header. Where bytes are dear a port has a shorter one
+The bytes of a datagram: docs/reference/network.md. Where bytes are dear a port has a shorter header
 (:class:`PortProperties`): two to four bytes of the hash in place of the first eight, and fewer agents. Where there is
-no room at all, a signed frame is the datagram. A busy computer sends late; its clock is not late, and says by how much
-the frame is. Times are integer ns, CLOCK_MONOTONIC unless said otherwise.
+no room at all, a signed frame is the datagram. Times are integer ns, CLOCK_MONOTONIC unless said otherwise.
 """
 
 from __future__ import annotations

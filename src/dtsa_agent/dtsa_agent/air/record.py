@@ -120,7 +120,7 @@ class AgentReports:
         self._joined_s = 0.0  # processor time until it had slots
         self.not_taken_in: Counter[str] = Counter()  # datagrams not accepted, by reason
         self._unsent: Counter[str] = Counter()  # own frames that the port has refused, by reason
-        self._hovered = [0, 0]  # slots without a quorum, before it flew for the first time and since then
+        self._hovered: Counter[tuple[int, bool]] = Counter()  # slots, by reason and whether it had flown before
         self._flew = False
         self._others = self._hears = 0  # agents that are present, and those heard of them, over all checks
         self._late, self._off = Delays(), Delays()  # frames sent, by how late they left; heard, by how far off
@@ -141,10 +141,8 @@ class AgentReports:
     def slot(self, station: Station, now_ns: int) -> None:
         """A slot has begun."""
         hovers = station.hovers
-        if hovers == HoverReason.NONE:
-            self._flew = True
-        elif hovers == HoverReason.NO_QUORUM:
-            self._hovered[self._flew] += 1
+        self._flew |= hovers == HoverReason.NONE
+        self._hovered[hovers, self._flew] += 1
         if now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + _STATUS_NS
             self.status(station.status, now_ns)
@@ -236,7 +234,10 @@ class AgentReports:
         """
         used, ended = _processor_s(), self.ended_ns or time.monotonic_ns()
         unsent = self._unsent + Counter({TOO_LATE: max(0, status.unsent - self._unsent.total())})
-        never = self._hovered[0] and not self._flew
+        held, shared = (self._hovered[why, False] for why in (HoverReason.NO_QUORUM, HoverReason.SAME_ID))
+        never = f"never had its quorum, and hovered for {held} slots" if held else ""
+        if shared > held:
+            never = f"another agent sent as {self._id}, and it hovered for {shared} slots"
         return {
             "wall_time_s": (ended - self.began_ns) / 1e9,
             "slots": status.slots,
@@ -257,9 +258,9 @@ class AgentReports:
             "times_corrected": status.shifts,
             "alignments": status.alignments,
             "flight_time_error_us": status.flight_error_ns / 1e3,
-            "never_flew": f"never had its quorum, and hovered for {self._hovered[0]} slots" if never else "",
-            "held_at_start_slots": self._hovered[0],
-            "held_slots": self._hovered[1],
+            "never_flew": "" if self._flew else never,
+            "held_at_start_slots": held,
+            "held_slots": self._hovered[HoverReason.NO_QUORUM, True],
             "slots_too_short": self._slots_too_short,
             "not_taken_in": dict(sorted((self.not_taken_in + Counter(refused_by_tables)).items())),
         }

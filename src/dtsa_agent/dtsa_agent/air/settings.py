@@ -43,6 +43,8 @@ class AgentSettings(Settings):
 
     def __post_init__(self) -> None:
         check(self)
+        if type(self.quorum) is int:  # as YAML and ROS have numbers
+            object.__setattr__(self, "quorum", str(self.quorum))
         parse_quorum(self.quorum)
 
 

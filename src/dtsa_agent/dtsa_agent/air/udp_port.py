@@ -7,7 +7,6 @@ import socket
 import struct
 import time
 from contextlib import suppress
-from typing import NamedTuple
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.kernel import ffi, lib
@@ -21,13 +20,6 @@ _IP_RECVERR = 11
 _IP_MULTICAST_ALL = 49  # Linux: 0: only groups that this socket has joined
 _SO_TIMESTAMPNS = 35
 _CHECK_NS = 1_000_000_000  # from one check whether the interface is still the same to the next
-
-
-class InterfaceState(NamedTuple):
-    """An interface now: both change when it is made anew or gets another address."""
-
-    number: int  # that the kernel gives the interface
-    address: str  # IPv4
 
 
 class UdpPort(Port):
@@ -47,7 +39,7 @@ class UdpPort(Port):
         self._reader = ffi.new("socket_reader *")
         lib.socket_start(self._reader, self._in.fileno())
         self.interface_changes = 0  # how often the group was joined again
-        self._state: InterfaceState | None = None  # by which the group is joined; None: the interface has gone
+        self._state: tuple[int, str] | None = None  # by which the group is joined; None: the interface has gone
         self._membership = b""
         self._check_due_ns = time.monotonic_ns() + _CHECK_NS
         try:
@@ -63,12 +55,12 @@ class UdpPort(Port):
             where, allowed = f"{settings.interface}, group {settings.group}", "one that takes part in the group"
             raise ConfigError("interface", where, f"{allowed} ({error.strerror})") from None
 
-    def _join(self, state: InterfaceState) -> None:
-        """Join the group, and send to it, by an interface as it is now."""
-        membership = struct.pack("=4s4si", socket.inet_aton(self._group[0]), b"\0\0\0\0", state.number)
+    def _join(self, state: tuple[int, str]) -> None:
+        """Join the group, and send to it, by an interface as it is now: its number and address."""
+        membership = struct.pack("=4s4si", socket.inet_aton(self._group[0]), b"\0\0\0\0", state[0])
         out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # a bound socket cannot get another address
         try:
-            out.bind((state.address, 0))
+            out.bind((state[1], 0))
             out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, membership)
             out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, self._settings.ttl)
             out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
@@ -102,7 +94,7 @@ class UdpPort(Port):
         except OSError:  # it is not ready yet
             return False
         self.interface_changes += 1
-        self.print(f"is another one now (number {state.number}, address {state.address}): joined the group again")
+        self.print("is another one now (number {}, address {}): joined the group again".format(*state))
         return True
 
     def fileno(self) -> int:
@@ -148,11 +140,12 @@ class UdpPort(Port):
         self._out.close()
 
 
-def _state_of(settings: UdpSettings) -> InterfaceState:
+def _state_of(settings: UdpSettings) -> tuple[int, str]:
+    """Number and IPv4 address of an interface: both change when it is made anew or gets another address."""
     name, number = settings.interface, settings.interface_index()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as query:
         try:
             answer = fcntl.ioctl(query, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
         except OSError:
             raise ConfigError("interface", name, "one with an IPv4 address") from None
-    return InterfaceState(number, socket.inet_ntoa(answer[20:24]))
+    return number, socket.inet_ntoa(answer[20:24])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -18,7 +19,6 @@ from dtsa_agent.core.station import (
     LENGTH,
     OTHER_SETTINGS,
     REJECTED,
-    STATES,
     HoverReason,
     Station,
     StationSettings,
@@ -43,8 +43,12 @@ def test_how_many_others_are_needed(text: str, by_others: dict[int, int]) -> Non
     assert {others: needed(text, others) for others in by_others} == by_others
 
 
-@pytest.mark.parametrize("text", ["", "all", "101%", "-1", "0.8", "1.5", "%", "8 %", "\u0663", "all-but-two"])
-def test_other_words_are_refused(text: str) -> None:
+def test_a_number_may_be_one() -> None:
+    assert AgentSettings.from_dict({"id": 1, "quorum": 3}) == AgentSettings(id=1, quorum="3")
+
+
+@pytest.mark.parametrize("text", ["", "all", "101%", "-1", "0.8", "1.5", "%", "8 %", "\u0663", "all-but-two", True])
+def test_other_words_are_refused(text: Any) -> None:
     with pytest.raises(ConfigError) as error:
         AgentSettings(id=1, quorum=text)
     assert error.value.field == "quorum"
@@ -59,10 +63,8 @@ def test_a_share_is_never_less_than_said(percent: int, others: int) -> None:
     assert 0 <= found <= others
 
 
-def status(hovers: int, hears: int, heard_by: int, state: int = 2) -> SimpleNamespace:
-    return SimpleNamespace(
-        hovers=hovers, others=5, hears=hears, heard_by=heard_by, needed=4, state=state, timed=0, off=0
-    )
+def status(hovers: int, hears: int, heard_by: int) -> SimpleNamespace:
+    return SimpleNamespace(hovers=hovers, others=5, hears=hears, heard_by=heard_by, needed=4, state=2, timed=0, off=0)
 
 
 def test_a_state_that_lasts_is_printed_once() -> None:
@@ -84,14 +86,6 @@ def test_a_state_that_lasts_is_printed_once() -> None:
     assert lines[2:] == ["flies: hears 4 of 5, is heard by 5 (quorum 4)"]
     reports.status(status(HoverReason.NONE, 5, 5), 99 * SECOND)
     assert len(lines) == 3
-
-
-def test_an_agent_that_hears_nobody_says_that_it_is_alone() -> None:
-    lines: list[str] = []
-    reports = AgentReports(1, 10.0, lines.append, 0)
-    for second in range(10):
-        reports.status(status(HoverReason.NO_QUORUM, 0, 0, STATES.index("alone")), second * SECOND)
-    assert lines == ["is alone, and hovers until it hears others"]
 
 
 #: Of a station that has done nothing yet.

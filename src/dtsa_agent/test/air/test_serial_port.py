@@ -14,11 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from waiting import wait_for
 
+from dtsa_agent.air.driver import AgentVehicle, LiveAgent
 from dtsa_agent.air.port import ReceivedDatagram, check_fits, flight_ns, shortest_slot_ns
 from dtsa_agent.air.serial_modems import LONGEST, MODEMS, OVERHEAD, lora_ns
 from dtsa_agent.air.serial_port import LineReader, SerialPort, to_line
-from dtsa_agent.air.settings import SerialSettings
+from dtsa_agent.air.settings import AgentSettings, SerialSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.stop import Stop
 
 DATAGRAMS = st.binary(min_size=1, max_size=LONGEST)
 
@@ -216,3 +218,13 @@ def test_a_line_that_carries_something_else_is_told_once(line: Line, content: by
         assert heard(port, 1)[0].data == b"still"
         assert len(said) == 1
         assert why in said[0]
+
+
+def test_what_comes_while_an_agent_waits_for_its_vehicle_is_not_lost(line, monkeypatch):
+    config, vehicle, asked = SwarmConfig(agents=2, policy="tdma", slot_ms=100.0), AgentVehicle(), list[int]()
+    monkeypatch.setattr(vehicle, "is_ready", lambda: asked.append(os.write(line.master, text)) or len(asked) > 5)
+    text = 100 * to_line(b"x")
+    with SerialPort(SerialSettings(device=str(line.path))) as port, Stop() as stop:
+        LiveAgent(AgentSettings(id=1, duration_s=1.0), config, port, vehicle=vehicle).run(stop)
+        assert len(asked) > 5
+        assert port.counts()["dropped_by_computer"] == 0

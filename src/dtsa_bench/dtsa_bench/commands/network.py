@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -171,13 +172,13 @@ frames: then a lease that it does not know looks like a broken rule."""
         directory = None if args.out is None else new_directory(args.out)
         path = None if directory is None else directory / "sniffed.mcap"
 
-        with Stop() as stop, Sniffer(config, port, path, warn) as sniffer:
+        with Stop() as stop, closing(Sniffer(config, port, path, warn)) as sniffer:
             sniffer.run(stop, duration)
         summary = sniffer.summary()
         text = json.dumps(summary, indent=2) + "\n"
+        print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
         if directory is not None:
             (directory / "summary.json").write_text(text, encoding="utf-8")
-        print(text if args.json else "\n".join(summary_lines(summary)) + "\n", end="")
         if sniffer.bag is not None and sniffer.bag.failure:
             raise BagError(sniffer.bag.failure)
         return 1 if summary["rules_broken"] else 0

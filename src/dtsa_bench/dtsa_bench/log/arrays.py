@@ -22,6 +22,7 @@ from dtsa_channel_sim.model.verdict import OUTCOMES
 UNKNOWN = len(OUTCOMES)  # outcome of a slot of which not all that could have sent have told
 PRESENT, LEAVING, UNRECORDED, NEW = 1, 2, 64, 128  # presence of an agent; the last two are added
 MAX_GAPS_LISTED = 5
+_MOST_MISSING = 1_000_000  # control instants of agents without a record
 DECIDED = ("chosen", "reason", "digest", "score")  # what an agent decides for a slot
 VECTORS = ("velocity", "command", "goal")  # at a slot's start
 
@@ -278,11 +279,14 @@ def extent_of(settings: Mapping[str, Any]) -> float:
     return float(value) if isinstance(value, (int, float)) and 0 < value < float("inf") else EXTENT_M
 
 
-def empty_arrays(slots: int, agents: int, steps: int, slot_ns: int) -> dict[str, Any]:
+def empty_arrays(slots: int, recorded: int, agents: int, steps: int, slot_ns: int) -> dict[str, Any]:
     """The arrays of a log of which nothing is known yet, by their names.
 
-    :raises ConfigError: if there is no memory for them.
+    :param recorded: of how many slots there is a record.
+    :raises ConfigError: if there is no memory for them, or so much is missing that a number must be damaged.
     """
+    if slots > 2 * recorded + 1000 and (slots - recorded) * agents * steps > _MOST_MISSING:
+        raise ConfigError("slots", slots, f"at most twice the {recorded} recorded ones; a number is damaged")
     what = f"{slots} slots of {steps} control instants"
     check_memory(8 * 3 * (steps + len(VECTORS)) * slots * agents, what, "agents", agents)  # the larger part of them
     shape, planes = (slots, agents), (slots, 3, agents)

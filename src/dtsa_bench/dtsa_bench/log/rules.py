@@ -191,6 +191,13 @@ class RuleChecker:
         self.unchecked = 0  # slots that may depend on such a frame
         self.double_slots = 0  # slots with two senders or more
 
+    def restart(self) -> None:
+        """Forget what was given away: the swarm was started again, and counts its slots anew."""
+        self._from, self._known_from = None, 0
+        if self._ledger is not None:
+            self._ledger.turns.clear()
+            self._ledger.quiet.clear()
+
     def check_slot(
         self,
         slot: int,

@@ -45,6 +45,7 @@ class HeldVehicle(AgentVehicle):
 class _OtherAgent:
     """What was heard of another agent."""
 
+    begun: bool = False  # somebody has heard it
     left: bool = False  # has announced that it leaves: its check is over
     new: bool = True  # on probation: it sends at its anchors only, or in turns of which others need not know yet
     expected: set[int] = field(default_factory=set)  # slots in which it was to send
@@ -86,10 +87,14 @@ class Check:
             other.delays_ns[frame.slot] = frame.arrival_ns - start_ns
             parsed = self._datagrams.read(frame.datagram)
             other.left, _, other.new = condition_in(parsed.frame)
+            other.begun = True
             for agent in range(1, self._config.agents + 1):
-                # An agent that leaves need hear nobody.
                 hears = self._datagrams.hears(parsed.names, agent) if self._datagrams.names else None
-                if hears is not None and agent != parsed.sender and not other.left:
+                about = self._others[agent]
+                about.begun |= hears is True
+                # An agent that leaves need hear nobody, nor be heard; one that has not begun cannot be.
+                is_there = agent == self._agent or (about.begun and not about.left)
+                if hears is not None and agent != parsed.sender and not other.left and (hears or is_there):
                     other.hears_count[agent] += 1 if hears else -1
 
     def refused(self, reason: str, data: bytes, arrival_ns: int) -> None:

@@ -26,12 +26,13 @@ from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS
 _PATIENCE_S = 0.05
 _BURST = 64
 _WAITS = 2  # slots that are kept open for frames that come late
+_SILENCE_NS = 2_000_000_000  # after this a frame of an earlier slot is of a swarm that was started again
 
 
 class Sniffer:
     """A listener.
 
-    :param path: file for what was heard; None: it is only judged.
+    :param path: file for what was heard; None: it is only judged. A swarm that is started again gets another one.
     :param log: prints a line when the port fails or is back; None: nothing is printed.
     :raises ConfigError: for a port that cannot be used, or without the key of signed frames.
     :raises BagError: if the file cannot be made.
@@ -46,14 +47,17 @@ class Sniffer:
         self._slots: dict[int, dict[int, tuple[int, bytes]]] = {}  # not judged yet: by sender, when it came, and what
         self._judged = -1  # last slot
         self._recorded_ns = 0  # when it was recorded to start
+        self._accepted_ns = 0  # when the last frame came
+        self._starts = 1  # of the swarm
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
         self._zero_ns = time.monotonic_ns()
         self._listener = open_port(port)
         self._listener.log = log
         about = {"port": dataclasses.asdict(port.properties), "port_settings": port.to_dict(), "zero_ns": self._zero_ns}
+        self._custom, self._path = {SNIFFER: json.dumps(about, sort_keys=True)}, path
         try:
-            self.bag = None if path is None else RecordFile(path, config, {SNIFFER: json.dumps(about, sort_keys=True)})
+            self.bag = None if path is None else RecordFile(path, config, self._custom)
         except DtsaError:
             self._listener.close()
             raise
@@ -65,23 +69,44 @@ class Sniffer:
             select.select([self._listener], [], [], _PATIENCE_S)
             for datagram in self._listener.receive(_BURST):
                 self._receive(datagram.data, datagram.arrival_ns)
-        for slot in sorted(self._slots):
-            self._close_slot(slot)
+        self._close_slots(max(self._slots, default=0))
 
     def _receive(self, data: bytes, arrival_ns: int) -> None:
         reason, sender, slot, *_ = self._datagrams.read(data)
         if not reason and slot <= self._judged:  # of a group that lies behind, or the same frame once more
-            reason = OTHER_TIME
+            if arrival_ns - self._accepted_ns > _SILENCE_NS:
+                self._start_again()
+            else:
+                reason = OTHER_TIME
         if not reason and sender in self._slots.get(slot, {}):
             reason = REPEATED
         if reason:
             self.refused[reason] += 1
             return
         self.heard[sender] += 1
+        self._accepted_ns = arrival_ns
         self._slots.setdefault(slot, {})[sender] = arrival_ns, frame_in(data, self._config)
-        for over in sorted(s for s in self._slots if s <= max(self._slots) - _WAITS):
-            self._close_slot(over)
-            self._judged = over
+        self._close_slots(max(self._slots) - _WAITS)
+
+    def _start_again(self) -> None:
+        """The swarm counts its slots anew: they are judged anew, and have a file of their own."""
+        self._close_slots(max(self._slots, default=0))
+        self._judged, self._starts = -1, self._starts + 1
+        self._rules.restart()
+        if self.bag is None or self._path is None:
+            return
+        self.bag.close()
+        if not self.bag.failure:
+            path = self._path.with_stem(f"{self._path.stem}_{self._starts}")
+            try:
+                self.bag = RecordFile(path, self._config, self._custom)
+            except DtsaError as error:
+                self.bag.failure = str(error)
+
+    def _close_slots(self, last: int) -> None:
+        for slot in sorted(slot for slot in self._slots if slot <= last):
+            self._close_slot(slot)
+            self._judged = slot
 
     def _close_slot(self, slot: int) -> None:
         """Check a slot, and record it: its time is that of the first frame that was heard in it."""
@@ -112,9 +137,3 @@ class Sniffer:
         self._listener.close()
         if self.bag is not None:
             self.bag.close()
-
-    def __enter__(self) -> Sniffer:
-        return self
-
-    def __exit__(self, *unused: object) -> None:
-        self.close()

@@ -85,19 +85,22 @@ def test_a_file_that_holds_no_settings_is_named(tmp_path, content, capsys):
     assert str(path) in refused(["agent", "--id", "1", "--swarm", str(path)], capsys)
 
 
-def test_a_summary_that_cannot_be_written_is_printed_and_the_file_is_named(tmp_path, capsys):
+@pytest.mark.parametrize(("command", "bag", "begins"), [
+    (["agent", "--id", "1", "--quorum", "0"], "cf1", "state"), (["sniff"], "sniffed", "heard"),
+])  # fmt: skip
+def test_a_summary_that_cannot_be_written_is_printed_and_the_file_is_named(tmp_path, capsys, command, bag, begins):
     """As on a disk that has become full: here a directory is in its place."""
     helpers.need_multicast()
     out = tmp_path / "cf1"
 
     def block() -> None:
-        while not (out / "cf1.mcap").exists():
+        while not (out / f"{bag}.mcap").exists():
             time.sleep(0.01)
         (out / "summary.json").mkdir()
 
     threading.Thread(target=block, daemon=True).start()
-    words = ("--no-seal", "--agents", "2", "--quorum", "0", "--interface", "lo", "--group", helpers.own_group())
-    assert main(["agent", "--id", "1", "--duration-s", "1", "--out", str(out), *words]) == 1
+    words = ("--no-seal", "--agents", "2", "--interface", "lo", "--group", helpers.own_group())
+    assert main([*command, "--duration-s", "1", "--out", str(out), *words]) == 1
     said = capsys.readouterr()
-    assert said.out.startswith("state")
-    assert f"cannot write {out / 'summary.json'}" in said.err.splitlines()[-1]
+    assert said.out.startswith(begins)
+    assert str(out / "summary.json") in said.err.splitlines()[-1]

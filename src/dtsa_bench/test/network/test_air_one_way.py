@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +194,7 @@ def _recorded(path: Path, slots: list[int], steps: int = CONFIG.steps, about: di
     with AgentRecorder(path, AgentSettings(id=1), CONFIG, UdpSettings(interface="lo")) as recorder:
         for at, slot in enumerate(slots):
             is_first = at == 0 or slot < slots[at - 1]
-            recorder.slot(SlotRecord(slot, 0, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
+            recorder.slot(SlotRecord(slot, slot * CONFIG.slot_ns, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
         custom = recorder._bag.custom_data
         custom[AGENT] = json.dumps(json.loads(custom[AGENT]) | (about or {}))
     return read(path)
@@ -207,6 +208,26 @@ def test_slots_of_times_that_were_given_up_are_kept_apart(tmp_path: Path) -> Non
     assert {key: values.tolist() for key, values in slots.items()} == {
         (1, 0): [3, 4], (1, 1): [5, 6], (1, -1): [70, 71], (1, -2): [80], (1, -3): [90, 91],
     }  # fmt: skip
+
+
+def test_frames_of_times_that_were_given_up_are_sent_and_share_no_slot_with_others(bags: list[Path]) -> None:
+    ones = [read(path) for path in bags[:2]]
+    before = Merge(ones).summary()
+    for one in ones:
+        one.earlier.append(ones[1].log)  # frames with the slot numbers of those of cf2
+    after = Merge(ones).summary()
+    assert after["frames_sent"] == before["frames_sent"] + 2 * len(ones[1].log.sent_frames.row)
+    shared = ("slots_with_two_senders", "slots_with_two_senders_before")
+    assert [after[name] for name in shared] == [before[name] for name in shared]
+
+
+@pytest.mark.parametrize(("last", "is_read"), [(100_000, True), (1 << 30, False)])
+def test_an_agent_may_stand_still_for_longer_than_it_flew(tmp_path: Path, last: int, is_read: bool) -> None:
+    slots = [3, 4, 5, last]
+    with nullcontext() if is_read else pytest.raises(UnusableBag):
+        bag = _recorded(tmp_path / "cf1.mcap", slots)
+        assert bag.slots.tolist() == slots
+        assert Merge([bag]).log.known.sum() == len(slots)
 
 
 @pytest.mark.parametrize("about", [

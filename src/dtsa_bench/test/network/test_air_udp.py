@@ -9,7 +9,7 @@ import resource
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,10 +22,13 @@ from rosbags.rosbag2 import Reader
 from waiting import wait_for
 
 import dtsa
+from dtsa_agent.air.port import link_of
 from dtsa_agent.air.settings import AgentSettings, UdpSettings
 from dtsa_agent.air.udp_port import UdpPort
-from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core import ConfigError, Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.core.station import StationSettings
+from dtsa_agent.stop import Stop
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import read
 from dtsa_bench.log.bag.metadata import MERGED_FROM
@@ -37,6 +40,7 @@ from dtsa_bench.log.merge.timeline import Crossings, fit
 from dtsa_bench.log.merged_bag import write_merged
 from dtsa_bench.log.record import SLOT_RECORD, load_log
 from dtsa_bench.log.verify.check import verify_bag
+from dtsa_bench.network.sniffer import Sniffer
 from dtsa_bench.pages.report.data import run_data
 
 KEY = "8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4"
@@ -418,7 +422,9 @@ def test_a_second_agent_of_the_same_id_hovers_and_is_silent(tmp_path: Path) -> N
         wait_for(lambda: again.heard[1] > 5 and first.speed > 0.05)  # in one time, and not new
         second = start(1, "second.mcap")
         wait_for(lambda: "hovers: another agent sends as 1" in second.said)
-    assert second.agent.summary()["sent"] <= 1  # its first turn may come before it hears the other one
+    found = second.agent.summary()
+    assert found["sent"] <= 1  # its first turn may come before it hears the other one
+    assert found["never_flew"]
 
 
 def test_an_agent_needs_no_ros(tmp_path: Path) -> None:
@@ -434,3 +440,23 @@ def test_an_agent_needs_no_ros(tmp_path: Path) -> None:
     assert (done.returncode, last) == (0, "[]"), done.stderr
     assert json.loads(said) == (summary := json.loads((tmp_path / "cf1" / "summary.json").read_text()))
     assert (summary["sealed"], summary["heard_of"]) == (False, [])
+
+
+def test_a_swarm_that_is_started_again_is_judged_and_recorded_anew(tmp_path: Path) -> None:
+    helpers.need_multicast()
+    config, udp = SwarmConfig(agents=2, policy="tdma"), UdpSettings(interface="lo", group=helpers.own_group())
+    datagrams = StationSettings(config, link_of(config, udp.properties))
+    with closing(Sniffer(config, udp, tmp_path / "sniffed.mcap")) as sniffer, Stop() as stop:
+        begins = time.monotonic_ns()
+        for starts_ns in (begins, begins + 60_000_000_000):
+            for slot in range(5, 25):
+                frame = encode_frame(Frame(slot % 2 + 1, slot, 1, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)))
+                sniffer._receive(datagrams.write(frame, slot), starts_ns + slot * config.slot_ns)
+        stop.signal = 1
+        sniffer.run(stop)
+    found = sniffer.summary()
+    assert (found["heard"], found["not_taken_in"]) == ({"cf1": 20, "cf2": 20}, {})
+    assert (found["frames_judged"], found["rules_broken"]) == (40, 0)
+    for name in ("sniffed.mcap", "sniffed_2.mcap"):
+        assert load_log(tmp_path / name).sent.sum() == 20
+        assert verify_bag(tmp_path / name).ok

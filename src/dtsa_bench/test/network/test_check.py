@@ -78,6 +78,15 @@ def test_what_is_missing_is_said(delays, hears, silent, missing):
     assert checked(delays, hears, silent).result()["missing"] == missing
 
 
+def test_who_begins_late_was_heard_by_nobody_before() -> None:
+    check = Check(1, CONFIG, NETWORK)
+    for slot in range(100, 300):
+        sender, there = slot % 4 + 1, [1, 2, 3, 4] if slot >= 230 else [1, 2, 4]
+        heard = [said(sender, slot, MS, [k for k in there if k != sender])] if sender in there[1:] else []
+        check.slot(record(slot, sender, heard, is_first=slot == 100))
+    assert check.result()["missing"] == []
+
+
 def test_it_lasts_until_all_can_tell_and_one_that_is_too_short_says_so() -> None:
     check = Check(1, CONFIG, NETWORK)
     for slot in range(100, 112):
