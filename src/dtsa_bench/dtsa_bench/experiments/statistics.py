@@ -34,7 +34,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class Mean:
-    """A mean with its bootstrap interval; the three are not a number without values."""
+    """A mean with its bootstrap interval: not a number without values; the interval, without two."""
 
     value: float
     low: float
@@ -64,15 +64,22 @@ def wilson(count: int, total: int, level: float = LEVEL) -> Share:
 
 
 def bootstrap_mean(values: Iterable[float], level: float = LEVEL, resamples: int = RESAMPLES) -> Mean:
-    """Return the mean of the finite values with a percentile bootstrap interval; equal values give equal intervals."""
+    """Return the mean of the finite values with a bootstrap interval; equal values give equal intervals.
+
+    Percentiles of resampled means are too close together by sqrt((n - 1) / n), and take the normal distribution where
+    few values need Student's (Hesterberg 2015): of 3 values such intervals hold the mean in 75 % of all cases, not in
+    95 %. So the distances from the mean to both are stretched by what is missing; not below 0 if no value is.
+    """
+    from scipy.special import stdtrit
+
     data = np.asarray(list(values), dtype=np.float64)
     data = data[np.isfinite(data)]
-    if not len(data):
-        return Mean(math.nan, math.nan, math.nan, 0)
-    mean = float(data.mean())
-    if len(data) == 1:
-        return Mean(mean, mean, mean, 1)
+    count, mean = len(data), float(data.mean()) if len(data) else math.nan
+    if count < 2:
+        return Mean(mean, math.nan, math.nan, count)
     random = np.random.Generator(np.random.PCG64(_SEED))
-    means = data[random.integers(0, len(data), (resamples, len(data)))].mean(axis=1)
-    low, high = np.quantile(means, ((1 - level) / 2, (1 + level) / 2))
-    return Mean(mean, float(low), float(high), len(data))
+    means = data[random.integers(0, count, (resamples, count))].mean(axis=1)
+    ends = np.quantile(means, ((1 - level) / 2, (1 + level) / 2))
+    student, normal = stdtrit(count - 1, 0.5 + level / 2), NormalDist().inv_cdf(0.5 + level / 2)
+    low, high = mean + (ends - mean) * student / normal * math.sqrt(count / (count - 1))
+    return Mean(mean, max(float(low), min(0.0, float(data.min()))), float(high), count)

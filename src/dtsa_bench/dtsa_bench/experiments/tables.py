@@ -97,13 +97,12 @@ class Group:
         return statistic.value, statistic.low, statistic.high
 
     def texts(self, measure: str, dash: str = "–") -> tuple[str, str]:
-        """Value and interval as text; a dash and nothing if no run counts."""
+        """Value and interval as text; a dash and nothing if no run counts, no interval if one does."""
         if measure == CRASHED:
             return share_texts(self.crashed, dash)
         mean, digits = self.mean(measure), MEASURES[measure].digits
-        if not mean.count:
-            return dash, ""
-        return f"{mean.value:.{digits}f}", f"{mean.low:.{digits}f}{dash}{mean.high:.{digits}f}"
+        value, *ends = (f"{number:.{digits}f}" for number in (mean.value, mean.low, mean.high))
+        return value if mean.count else dash, dash.join(ends) if mean.count > 1 else ""
 
     def flat(self) -> Row:
         """One row of plain values: labels, how the flights ended, and means with their intervals."""
@@ -124,7 +123,8 @@ class Group:
             "left_out": self.left_out,
             "crashed": {"count": crashed.count, "of": crashed.total, "low": crashed.low, "high": crashed.high},
             **{
-                name: {"mean": mean.value, "low": mean.low, "high": mean.high, "runs": mean.count}
+                name: {"mean": mean.value, "runs": mean.count}
+                | ({"low": mean.low, "high": mean.high} if mean.count > 1 else {})
                 for name, mean in means.items()
                 if mean.count
             },
@@ -278,7 +278,7 @@ def table_html(table: SweepTable, shown: Sequence[str] = SHOWN, most: int | None
 
 def _interval(point: tuple[float, float, float], low: float, high: float) -> str:
     """A line for the interval, and a dot for the value."""
-    if not math.isfinite(point[0]) or high <= low:
+    if not all(map(math.isfinite, point)) or high <= low:
         return ""
     x, begin, end = (4 + 122 * (at - low) / (high - low) for at in point)
     return (
