@@ -43,7 +43,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("time_s", "s", "start of that slot"),
         ("sender", "", "id of the agent that sent it"),
         ("received", "1", "agents that received it"),
-        ("lost", "1", "agents that lost it to noise (merged, or without slots: that did not receive it, for whatever reason)"),
+        ("lost", "1", "agents that lost it to noise (merged, or without slots: that did not receive it)"),
         ("collided", "1", "agents at which it collided with another frame; empty: not known"),
         ("length", "byte", "length of the frame"),
         ("data", "", "the frame, hexadecimal"),

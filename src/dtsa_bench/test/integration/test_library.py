@@ -228,6 +228,14 @@ def test_plots_are_figures_of_what_they_are_given(flight: dtsa.FlightLog, swept:
         assert figure.axes
     matrix = dtsa.plot_matrix(swept, rows="scheme", columns="loss", y="crashed").axes[0]
     assert (matrix.get_ylabel(), matrix.get_xlabel()) == ("scheme", "loss")
+    pooled = swept.runs().groupby("scheme", sort=False)["age_mean_slots"].mean().tolist()  # over all levels of `loss`
+    bars = dtsa.plot_bars(swept, x="scheme", y="age_mean_slots").axes[0].patches
+    assert [bar.get_height() for bar in bars] == pytest.approx(pooled)
+    both = dtsa.plot_matrix(swept, rows="scheme", columns="loss", y=["crashed", "age_mean_slots"])
+    assert [len(axis.texts) for axis in both.axes] == [len(swept.table())] * 2
+    close = dtsa.sweep(axes={"policy": ["tdma"]}, base={"agents": 2, "collision_m": 0.5, "timeout_s": 0.2}, seeds=1)
+    distances = dtsa.plot_bars(close, x="policy", y="min_distance_m").axes[0]
+    assert 0.5 in [line.get_ydata()[0] for line in distances.lines]  # where two have crashed
     own = Figure().subplots(2, 2).ravel()
     assert dtsa.plot_ages(flight, ax=own[0]) is own[0].figure
     assert (

@@ -13,7 +13,8 @@ from dtsa_bench.experiments.charts import draw, league_scores
 from dtsa_bench.experiments.league import HEADS, STAR, LeagueTable
 from dtsa_bench.experiments.paper import seeds_text
 from dtsa_bench.experiments.statistics import LEVEL, wilson
-from dtsa_bench.experiments.tables import CRASHED, SweepTable, label_of
+from dtsa_bench.experiments.sweep import CRASHED
+from dtsa_bench.experiments.tables import SweepTable, label_of
 from dtsa_bench.pages.html import render_page, write_page
 
 
