@@ -11,6 +11,7 @@ import numpy as np
 
 LEVEL = 0.95  # of every interval in reports, unless said otherwise
 RESAMPLES = 4000
+_AT_ONCE = 1 << 22  # values drawn that are in memory at once
 _SEED = 20_240_229  # the intervals of a report are the same whenever it is made again
 
 
@@ -78,7 +79,11 @@ def bootstrap_mean(values: Iterable[float], level: float = LEVEL, resamples: int
     if count < 2:
         return Mean(mean, math.nan, math.nan, count)
     random = np.random.Generator(np.random.PCG64(_SEED))
-    means = data[random.integers(0, count, (resamples, count))].mean(axis=1)
+    rows = max(1, _AT_ONCE // count)
+    means = np.concatenate([
+        data[random.integers(0, count, (min(rows, resamples - first), count))].mean(axis=1)
+        for first in range(0, resamples, rows)
+    ])  # fmt: skip
     ends = np.quantile(means, ((1 - level) / 2, (1 + level) / 2))
     student, normal = stdtrit(count - 1, 0.5 + level / 2), NormalDist().inv_cdf(0.5 + level / 2)
     low, high = mean + (ends - mean) * student / normal * math.sqrt(count / (count - 1))

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dtsa_bench.experiments import statistics
 from dtsa_bench.experiments.statistics import bootstrap_mean, wilson
 
 
@@ -49,6 +50,13 @@ def test_no_runs_say_nothing_and_what_is_no_number_is_left_out() -> None:
     assert bootstrap_mean([3.0]).value == 3.0
     assert math.isnan(bootstrap_mean([3.0]).low)  # one value says nothing of how far off it is
     assert bootstrap_mean([0.0, 0.0, 9.0]).low == 0.0
+
+
+def test_many_seeds_take_no_more_memory_and_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(2).normal(5.0, 1.0, 31)
+    whole = bootstrap_mean(values)
+    monkeypatch.setattr(statistics, "_AT_ONCE", 100)
+    assert bootstrap_mean(values) == whole
 
 
 @pytest.mark.parametrize(("draw", "count"), [("exponential", 30), ("normal", 30), ("normal", 5), ("normal", 3)])
