@@ -1,5 +1,7 @@
 """Figures. Each function returns a `matplotlib.figure.Figure`; nothing is shown or saved.
 
+Flights of a sweep that differ in an axis without a place in the figure count together.
+
 In a notebook a cell that ends with a figure shows it. `ax` draws into axes of a figure of your own: one axes, or as
 many as the figure has panels.
 """
@@ -19,7 +21,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.drawing.flight_paths import paint
 from dtsa_bench.drawing.style import QUIET, colours, panels, style
 from dtsa_bench.experiments import charts
-from dtsa_bench.experiments.tables import CRASHED, MEASURES
+from dtsa_bench.experiments.sweep import check_figure
 from dtsa_bench.log.flight_log import FlightLog
 
 from ._sweep import SweepResult
@@ -135,7 +137,7 @@ def plot_bars(
     :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: for an axis or a measure that does not exist.
     """
-    return _chart(result, charts.bars, y, ax, x=x, series=series)
+    return _chart(result, "bars", y, ax, x=x, series=series)
 
 
 def plot_lines(
@@ -152,7 +154,7 @@ def plot_lines(
     :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: for an axis or a measure that does not exist.
     """
-    return _chart(result, charts.lines, y, ax, x=x, series=series, facets=facets)
+    return _chart(result, "lines", y, ax, x=x, series=series, facets=facets)
 
 
 def plot_matrix(result: SweepResult, *, rows: str, columns: str, y: str | Sequence[str], ax: Panels = None) -> Figure:
@@ -165,21 +167,14 @@ def plot_matrix(result: SweepResult, *, rows: str, columns: str, y: str | Sequen
     :param ax: axes to draw in; None: a new figure.
     :raises ConfigError: for an axis or a measure that does not exist.
     """
-    return _chart(result, charts.matrix, y, ax, rows=rows, columns=columns)
+    return _chart(result, "matrix", y, ax, rows=rows, columns=columns)
 
 
-def _chart(result: SweepResult, draw: Any, y: str | Sequence[str], ax: Panels, **roles: str | None) -> Figure:
+def _chart(result: SweepResult, kind: str, y: str | Sequence[str], ax: Panels, **roles: str | None) -> Figure:
     spec: dict[str, Any] = {role: axis for role, axis in roles.items() if axis is not None}
-    for role, axis in spec.items():
-        if axis not in result.axes:
-            raise ConfigError(role, axis, f"one of the axes {', '.join(result.axes)}")
-    spec["y"] = [y] if isinstance(y, str) else list(y)
-    for measure in spec["y"]:
-        if measure != CRASHED and measure not in MEASURES:
-            raise ConfigError("y", measure, ", ".join((CRASHED, *MEASURES)))
-    with style():
-        figure: Figure = draw(result._table, spec, _listed(ax))
-    return figure
+    spec |= {"kind": kind, "y": [y] if isinstance(y, str) else list(y)}
+    check_figure(spec, result._table.sweep.spec.axes)
+    return charts.draw(result._table, spec, _listed(ax))
 
 
 def _titles(flights: Sequence[FlightLog], titles: Sequence[str] | None) -> list[str]:

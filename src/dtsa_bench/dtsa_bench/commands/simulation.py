@@ -140,7 +140,6 @@ stopped when the same command is given again. Sweeps of your own: docs/how-to/sw
 
 
 def _sweeps(args: argparse.Namespace) -> list[Sweep]:
-    from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.experiments import sweep as spec
     from dtsa_bench.runs.options import named_values, whole_number
 
@@ -151,11 +150,7 @@ def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     }
     if args.file:
         return [spec.load_file(args.file, **changes)]
-    names = [name.strip() for name in args.preset.split(",")]
-    for name in names:
-        if name not in spec.preset_names():
-            raise ConfigError("preset", name, ", ".join(spec.preset_names()))
-    return [spec.load_preset(name, **changes) for name in names]
+    return [spec.load_preset(name.strip(), **changes) for name in args.preset.split(",")]
 
 
 def _fly_sweep(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:

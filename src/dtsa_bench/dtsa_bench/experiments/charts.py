@@ -27,15 +27,16 @@ from dtsa_bench.drawing.style import (
     panels,
     style,
 )
+from dtsa_bench.runs.config import RunLimits
 
 from .flight_figures import estimate, trajectories
 from .league import LeagueTable
-from .tables import CRASHED, MEASURES, Group, SweepTable, label_of
+from .sweep import CRASHED, MEASURES
+from .tables import Group, SweepTable, label_of
 
 Spec = Mapping[str, Any]
 _GOOD_TO_BAD = LinearSegmentedColormap.from_list("good-bad", ["#e8f4ee", "#f6e3b4", "#dd8a6f", "#a8402b"])
 _NEUTRAL = LinearSegmentedColormap.from_list("neutral", ["#eef3f9", "#9dbbdc", "#3d6fa8"])
-COLLISION_M = 0.2
 
 AXIS_LABELS = {
     "agents": "quadcopters", "moving": "moving quadcopters", "slot_ms": "slot length [ms]", "loss": "loss",
@@ -44,9 +45,11 @@ AXIS_LABELS = {
 
 
 def _group(table: SweepTable, labels: Mapping[str, Any]) -> Group | None:
-    """The only group with these labels that has rows; None if there is none or more than one."""
+    """All flights with these labels; None if there are none. Levels of axes without a label count together."""
     groups = [group for group in table.select_groups(**labels) if group.rows]
-    return groups[0] if len(groups) == 1 else None
+    if len(groups) < 2:
+        return groups[0] if groups else None
+    return Group(groups[0].cell, [row for group in groups for row in group.rows])
 
 
 def _points(table: SweepTable, labels: Mapping[str, Any], axis: str, measure: str) -> np.ndarray[Any, Any]:
@@ -80,12 +83,12 @@ def bars(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> 
             axis.errorbar(places, data[:, 0], _whiskers(data), fmt="none", ecolor=INK, elinewidth=1, capsize=2)
             if axis is axes[0]:
                 handles.append(drawn)
-        _dress(axis, spec, measure, xs)
+        _dress(axis, table, spec, measure, xs)
     add_legend(axes, handles, series, above=given is None)
     return figure
 
 
-def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
+def _dress(axis: Axes, table: SweepTable, spec: Spec, measure: str, xs: list[Any]) -> None:
     axis.set_title(label_of(measure))
     crowded = any(len(str(x)) > 8 for x in xs)
     axis.set_xticks(
@@ -95,7 +98,8 @@ def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
     axis.grid(axis="x", visible=False)
     axis.tick_params(axis="x", length=0)
     if measure == "min_distance_m":
-        axis.axhline(COLLISION_M, color=QUIET, linewidth=1, linestyle=":")
+        for limit in {cell.settings.get("collision_m", RunLimits().collision_m) for cell in table.sweep.cells}:
+            axis.axhline(limit, color=QUIET, linewidth=1, linestyle=":")
     if measure in spec.get("log", ()):
         _logarithmic(axis)
     elif measure == "efficiency_mean":
@@ -117,9 +121,7 @@ def lines(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) ->
     handles: list[Any] = []
     for axis, (facet, measure) in zip(axes, shown, strict=True):
         for number, name in enumerate(series):
-            labels = ({} if facet is None else {spec["facets"]: facet}) | (
-                {} if name is None else {spec["series"]: name}
-            )
+            labels = _labels(spec, facet) | ({} if name is None else {spec["series"]: name})
             data = _points(table, labels, spec["x"], measure)
             finite = np.isfinite(data[:, 0])
             place = np.array(xs, dtype=float)[finite]
@@ -162,37 +164,41 @@ def _facet(axis: str, value: object) -> str:
 
 
 def matrix(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> Figure:
-    """A coloured cell with its number for each of ``rows`` and ``columns``; a panel for each of ``facets``."""
+    """A coloured cell with its number for each of ``rows`` and ``columns``; a panel for each facet and measure."""
     facets = table.levels(spec["facets"]) if "facets" in spec else [None]
-    rows, columns, measure = table.levels(spec["rows"]), table.levels(spec["columns"]), spec["y"][0]
+    rows, columns = table.levels(spec["rows"]), table.levels(spec["columns"])
     longest = max(len(str(row)) for row in rows)
     wide = max(0.95, 0.095 * max(len(str(column)) for column in columns))
     figure, axes = panels(
-        len(facets),
+        len(spec["y"]) * len(facets),
         width=1.5 + 0.075 * longest + wide * len(columns),
         height=1.05 + 0.36 * len(rows),
         columns=2,
         given=given,
     )
-    finite = [value for group in table.groups_with_runs if math.isfinite(value := group.point(measure)[0])]
-    top = 1.0 if measure == CRASHED else max(finite, default=1.0)
-    bottom = 0.0 if measure == CRASHED else min(finite, default=0.0)
-    for axis, facet in zip(axes, facets, strict=True):
-        fixed = {} if facet is None else {spec["facets"]: facet}
-        values = np.full((len(rows), len(columns)), math.nan)
-        for (i, row), (j, column) in product(enumerate(rows), enumerate(columns)):
-            labels = {spec["rows"]: row, spec["columns"]: column, **fixed}
-            group = _group(table, labels)
-            if group is None:
-                continue
-            values[i, j] = group.point(measure)[0]
-            dark = (values[i, j] - bottom) / ((top - bottom) or 1.0) > 0.62
-            text = _cell_text(group, measure)
-            axis.text(j, i, text, ha="center", va="center", fontsize=8.5, color=ON_DARK if dark else ON_LIGHT)
+    groups = [
+        [
+            [_group(table, {spec["rows"]: row, spec["columns"]: column} | _labels(spec, facet)) for column in columns]
+            for row in rows
+        ]
+        for facet in facets
+    ]
+    for (measure, (number, facet)), axis in zip(product(spec["y"], enumerate(facets)), axes, strict=True):
+        values = np.array([
+            [[math.nan if group is None else group.point(measure)[0] for group in line] for line in panel]
+            for panel in groups
+        ])  # fmt: skip
+        finite = values[np.isfinite(values)]
+        bottom, top = (0.0, 1.0) if measure == CRASHED or not len(finite) else (finite.min(), finite.max())
+        for (i, j), value in np.ndenumerate(values[number]):
+            if (group := groups[number][i][j]) is not None:
+                dark = (value - bottom) / ((top - bottom) or 1.0) > 0.62
+                text = _cell_text(group, measure)
+                axis.text(j, i, text, ha="center", va="center", fontsize=8.5, color=ON_DARK if dark else ON_LIGHT)
         axis.pcolormesh(
             np.arange(len(columns) + 1) - 0.5,
             np.arange(len(rows) + 1) - 0.5,
-            np.ma.masked_invalid(values),
+            np.ma.masked_invalid(values[number]),
             cmap=_GOOD_TO_BAD if measure == CRASHED else _NEUTRAL,
             vmin=bottom,
             vmax=top or 1.0,
@@ -203,6 +209,11 @@ def matrix(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -
         axis.set_title(title if facet is None else f"{title}: {_facet(spec['facets'], facet)}")
         _dress_matrix(axis, rows, columns, spec)
     return figure
+
+
+def _labels(spec: Spec, facet: object) -> dict[str, Any]:
+    """Labels of the groups in a panel."""
+    return {} if facet is None else {spec["facets"]: facet}
 
 
 def _dress_matrix(axis: Axes, rows: list[Any], columns: list[Any], spec: Spec) -> None:
@@ -225,15 +236,15 @@ def _cell_text(group: Group, measure: str) -> str:
     return f"{value:.{MEASURES[measure].digits}f}" if math.isfinite(value) else "–"
 
 
-_DRAW: dict[str, Callable[[SweepTable, Any], Figure]] = {
+_DRAW: dict[str, Callable[..., Figure]] = {
     "bars": bars, "lines": lines, "matrix": matrix, "trajectories": trajectories, "estimate": estimate,
 }  # fmt: skip
 
 
-def draw(table: SweepTable, spec: Spec) -> Figure:
-    """Draw a figure in the house style, as the sweep names it."""
+def draw(table: SweepTable, spec: Spec, given: Sequence[Axes] | None = None) -> Figure:
+    """Draw a figure in the house style, as the sweep names it; the first three kinds into axes that are given."""
     with style():
-        return _DRAW[spec["kind"]](table, spec)
+        return _DRAW[spec["kind"]](table, spec, *(() if given is None else (given,)))
 
 
 def league_scores(table: LeagueTable) -> Figure:

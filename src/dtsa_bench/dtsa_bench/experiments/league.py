@@ -238,7 +238,7 @@ class Scores:
     crashed: int
     timed_out: int
     failed: int
-    age_ms: tuple[float, float, float]  # geometric mean with its 95 % interval, cells weighing the same
+    age_ms: tuple[float, float, float]  # geometric mean, cells weighing the same; its 95 % interval, NaN of one seed
     load: float  # share of time on the air; not a number if nothing could be flown
 
 
@@ -252,7 +252,7 @@ def scores(the_league: League, flights: Mapping[str, Sequence[Sequence[Any]]]) -
     loads = [[flight[_LOAD] for flight in lines if flight[_LOAD] is not None] for lines in flights.values()]
     means = [np.mean(part) for part in loads if part]
     mean = float(np.mean([part.mean() for part in ages]))
-    variances = [float(part.var(ddof=1) / len(part)) if len(part) > 1 else 0.0 for part in ages]
+    variances = [float(part.var(ddof=1) / len(part)) if len(part) > 1 else math.nan for part in ages]
     half = NormalDist().inv_cdf(0.5 + LEVEL / 2) * math.sqrt(sum(variances)) / len(ages)
     return Scores(
         wilson(len(ends) - ends.count("completed"), len(ends)),
@@ -315,7 +315,8 @@ class LeagueTable:
         for rank, (entry, total, cells) in enumerate(zip(self.entries, self.scores, self.by_cell, strict=True), 1):
             worst = max(cells, key=lambda name: self._badness(name, cells[name]))
             count, percent = share_texts(total.lost, dash)
-            age, low, high = map(figure, total.age_ms)
+            age, *ends = map(figure, total.age_ms)
+            interval = "" if math.isnan(total.age_ms[1]) else f" ({dash.join(ends)})"
             not_flown = f" + {total.failed} not flown" if total.failed else ""
             lines.append(
                 [
@@ -324,7 +325,7 @@ class LeagueTable:
                     f"{count} ({percent})",
                     str(total.crashed),
                     f"{total.timed_out}{not_flown}",
-                    f"{age} ({low}{dash}{high})",
+                    f"{age}{interval}",
                     percent_text(total.load),
                     f"{worst}: {cells[worst].lost}, {figure(cells[worst].age_ms[0])} ms",
                 ]

@@ -17,8 +17,8 @@ from dtsa_bench.drawing.style import save_described
 from .batch import write_whole
 from .charts import draw
 from .provenance import read_provenance
-from .sweep import Sweep
-from .tables import CRASHED, MEASURES, SweepTable, latex_table
+from .sweep import CRASHED, MEASURES, Sweep, is_number
+from .tables import SweepTable, latex_table
 
 FORMATS = ("pdf", "svg", "png")
 
@@ -98,4 +98,4 @@ def _figures(sweep: Sweep) -> Sequence[Mapping[str, Any]]:
 
 
 def _numbers(levels: Sequence[object]) -> bool:
-    return len(set(levels)) > 1 and all(isinstance(n, (int, float)) and not isinstance(n, bool) for n in levels)
+    return len(set(levels)) > 1 and all(map(is_number, levels))

@@ -11,6 +11,7 @@ import numpy as np
 
 LEVEL = 0.95  # of every interval in reports, unless said otherwise
 RESAMPLES = 4000
+_AT_ONCE = 1 << 22  # values drawn that are in memory at once
 _SEED = 20_240_229  # the intervals of a report are the same whenever it is made again
 
 
@@ -34,7 +35,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class Mean:
-    """A mean with its bootstrap interval; the three are not a number without values."""
+    """A mean with its bootstrap interval: not a number without values; the interval, without two."""
 
     value: float
     low: float
@@ -64,15 +65,26 @@ def wilson(count: int, total: int, level: float = LEVEL) -> Share:
 
 
 def bootstrap_mean(values: Iterable[float], level: float = LEVEL, resamples: int = RESAMPLES) -> Mean:
-    """Return the mean of the finite values with a percentile bootstrap interval; equal values give equal intervals."""
+    """Return the mean of the finite values with a bootstrap interval; equal values give equal intervals.
+
+    Percentiles of resampled means are too close together by sqrt((n - 1) / n), and take the normal distribution where
+    few values need Student's (Hesterberg 2015): of 3 values such intervals hold the mean in 75 % of all cases, not in
+    95 %. So the distances from the mean to both are stretched by what is missing; not below 0 if no value is.
+    """
+    from scipy.special import stdtrit
+
     data = np.asarray(list(values), dtype=np.float64)
     data = data[np.isfinite(data)]
-    if not len(data):
-        return Mean(math.nan, math.nan, math.nan, 0)
-    mean = float(data.mean())
-    if len(data) == 1:
-        return Mean(mean, mean, mean, 1)
+    count, mean = len(data), float(data.mean()) if len(data) else math.nan
+    if count < 2:
+        return Mean(mean, math.nan, math.nan, count)
     random = np.random.Generator(np.random.PCG64(_SEED))
-    means = data[random.integers(0, len(data), (resamples, len(data)))].mean(axis=1)
-    low, high = np.quantile(means, ((1 - level) / 2, (1 + level) / 2))
-    return Mean(mean, float(low), float(high), len(data))
+    rows = max(1, _AT_ONCE // count)
+    means = np.concatenate([
+        data[random.integers(0, count, (min(rows, resamples - first), count))].mean(axis=1)
+        for first in range(0, resamples, rows)
+    ])  # fmt: skip
+    ends = np.quantile(means, ((1 - level) / 2, (1 + level) / 2))
+    student, normal = stdtrit(count - 1, 0.5 + level / 2), NormalDist().inv_cdf(0.5 + level / 2)
+    low, high = mean + (ends - mean) * student / normal * math.sqrt(count / (count - 1))
+    return Mean(mean, max(float(low), min(0.0, float(data.min()))), float(high), count)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +22,6 @@ from dtsa_channel_sim import ChannelConfig, MeasuredLosses
 from .batch import Batch, Row, Task, key_of
 
 PRESETS = Path(__file__).resolve().parent / "presets"
-FIGURE_KINDS = ("bars", "lines", "matrix", "trajectories", "estimate")
 FIRST_SEED = 1001  # of reports; those below are for tuning and tests
 #: Results of one run as columns, in this order; ``slots_...`` are parts of ``slots`` in the summary.
 VALUES = (
@@ -33,10 +33,45 @@ VALUES = (
     "agreement_share", "equal_tables_share", "first_divergence_slot", "wall_time_s",
 )  # fmt: skip
 COMMON = ("seed", "status", "reason", "collided")
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """A number that a flight has, and which flights count for it."""
+
+    name: str
+    label: str
+    unit: str
+    digits: int
+    complete_only: bool  # only flights that were completed without a crash, as in the paper
+    head: str = ""  # in tables on a terminal; empty: not shown there
+
+
+MEASURES = {
+    measure.name: measure
+    for measure in (
+        Measure("min_distance_m", "minimum distance", "m", 3, True, "dist m"),
+        Measure("efficiency_mean", "trajectory efficiency", "", 3, True, "effic"),
+        Measure("completion_time_s", "completion time", "s", 2, True, "time s"),
+        Measure("age_mean_slots", "age", "slots", 2, False, "age slots"),
+        Measure("age_mean_ms", "age", "ms", 1, False, "age ms"),
+        Measure("waking_age_mean_slots", "age from waking on", "slots", 2, False, "waking age"),
+        Measure("waking_age_mean_ms", "age from waking on", "ms", 1, False),
+        Measure("first_heard_95_slots", "95 % of wakings heard after", "slots", 1, False),
+        Measure("channel_load", "share of time on the air", "", 4, False),
+        Measure("estimate_error_mean_m", "error of estimates", "m", 4, False),
+        Measure("wasted_share", "slots without a frame", "", 3, False),
+    )
+}
+CRASHED = "crashed"  # a share, not a mean; may stand where a measure's name stands
 #: Names that no axis may have.
-RESERVED = frozenset(
-    ("key", "cell", "summary", "runs", "timed_out", "left_out", "crashed", "wasted_share", *COMMON, *VALUES)
-)
+RESERVED = frozenset(("key", "cell", "summary", "runs", "timed_out", "left_out", CRASHED, *MEASURES, *COMMON, *VALUES))
+#: Axes that figures need and those that they may have, by kind; the first three are of measures.
+FIGURES = {
+    "bars": (("x",), ("series",)), "lines": (("x",), ("series", "facets")),
+    "matrix": (("rows", "columns"), ("facets",)), "trajectories": (("facets",), ()),
+    "estimate": (("facets",), ()),
+}  # fmt: skip
 # Settings by section. Those of the channel that follow from the swarm's are left out.
 _SECTIONS: dict[str, dict[str, Setting]] = {
     "swarm": {spec.name: spec for spec in settings_of(SwarmConfig)},
@@ -68,7 +103,7 @@ class SweepSpec(Settings):
         object.__setattr__(self, "axes", axes)
         if not isinstance(self.figures, (list, tuple)):
             raise ConfigError("figures", self.figures, "a list")
-        figures = tuple(_figure(entry, index, list(axes)) for index, entry in enumerate(self.figures))
+        figures = tuple(_figure(entry, index, axes) for index, entry in enumerate(self.figures))
         object.__setattr__(self, "figures", figures)
         _seeds(self.seeds, None, None)
 
@@ -270,15 +305,46 @@ def _seeds(listed: object, count: int | None, first: int | None) -> tuple[int, .
     return tuple(range(start, start + number))
 
 
-def _figure(entry: object, index: int, axes: list[str]) -> dict[str, Any]:
-    figure = _mapping(entry, f"figures[{index}]")
-    if figure.get("kind") not in FIGURE_KINDS:
-        raise ConfigError(f"figures[{index}].kind", figure.get("kind"), ", ".join(FIGURE_KINDS))
-    for role in ("x", "series", "rows", "columns", "facets"):
-        if role in figure and figure[role] not in axes:
-            raise ConfigError(f"figures[{index}].{role}", figure[role], "one of the axes " + ", ".join(axes))
+def _figure(entry: object, index: int, axes: Mapping[str, Any]) -> dict[str, Any]:
+    place = f"figures[{index}]"
+    figure = _mapping(entry, place)
+    check_figure(figure, axes, f"{place}.")
     figure.setdefault("name", figure["kind"] if index == 0 else f"{figure['kind']}-{index + 1}")
+    if not re.fullmatch(r"\w[\w.-]*", str(figure["name"])):
+        raise ConfigError(f"{place}.name", figure["name"], "letters, digits, dots and hyphens: it names files")
     return figure
+
+
+def check_figure(figure: Mapping[str, Any], axes: Mapping[str, Any], place: str = "") -> None:
+    """Check a figure of a sweep with some axes and their levels; `place` is where it stands, for errors.
+
+    :raises ConfigError: naming what is not usable.
+    """
+    kind = figure.get("kind")
+    if kind not in list(FIGURES):
+        raise ConfigError(f"{place}kind", kind, ", ".join(FIGURES))
+    needed, more = FIGURES[kind]
+    lists = ("y", "log") if kind in ("bars", "lines", "matrix") else ()
+    for name, value in figure.items():
+        if name not in (allowed := (*needed, *more, *lists, "kind", "name", "caption")):
+            raise ConfigError(f"{place}{name}", value, f"of {kind}: {', '.join(allowed)}")
+    for role in (*needed, *(name for name in more if name in figure)):
+        if figure.get(role) not in list(axes):
+            raise ConfigError(f"{place}{role}", figure.get(role), "one of the axes " + ", ".join(axes))
+    if kind == "lines" and not all(is_number(level) for level in axes[figure["x"]]):
+        raise ConfigError(f"{place}x", figure["x"], "an axis of numbers")
+    for name in lists:
+        measures = figure.get(name, [])
+        if not isinstance(measures, (list, tuple)) or (name == "y" and not measures):
+            raise ConfigError(f"{place}{name}", figure.get(name), "a list of measures")
+        for measure in measures:
+            if measure not in (CRASHED, *MEASURES):
+                raise ConfigError(f"{place}{name}", measure, ", ".join((CRASHED, *MEASURES)))
+
+
+def is_number(level: object) -> bool:
+    """Whether a level of an axis is a number."""
+    return isinstance(level, (int, float)) and not isinstance(level, bool)
 
 
 def _mapping(value: object, name: str) -> dict[str, Any]:

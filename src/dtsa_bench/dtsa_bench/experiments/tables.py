@@ -9,47 +9,17 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .batch import FAILED, Row, write_whole
 from .statistics import Mean, Share, bootstrap_mean, wilson
-from .sweep import COMMON, VALUES, Cell, Sweep
+from .sweep import COMMON, CRASHED, MEASURES, VALUES, Cell, Measure, Sweep
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True, slots=True)
-class Measure:
-    """A number that a flight has, and which flights count for it."""
-
-    name: str
-    label: str
-    unit: str
-    digits: int
-    complete_only: bool  # only flights that were completed without a crash, as in the paper
-    head: str = ""  # in tables on a terminal; empty: not shown there
-
-
-MEASURES = {
-    measure.name: measure
-    for measure in (
-        Measure("min_distance_m", "minimum distance", "m", 3, True, "dist m"),
-        Measure("efficiency_mean", "trajectory efficiency", "", 3, True, "effic"),
-        Measure("completion_time_s", "completion time", "s", 2, True, "time s"),
-        Measure("age_mean_slots", "age", "slots", 2, False, "age slots"),
-        Measure("age_mean_ms", "age", "ms", 1, False, "age ms"),
-        Measure("waking_age_mean_slots", "age from waking on", "slots", 2, False, "waking age"),
-        Measure("waking_age_mean_ms", "age from waking on", "ms", 1, False),
-        Measure("first_heard_95_slots", "95 % of wakings heard after", "slots", 1, False),
-        Measure("channel_load", "share of time on the air", "", 4, False),
-        Measure("estimate_error_mean_m", "error of estimates", "m", 4, False),
-        Measure("wasted_share", "slots without a frame", "", 3, False),
-    )
-}
-CRASHED = "crashed"  # a share, not a mean; may stand where a measure's name stands
 SHOWN = (
     "age_mean_slots", "age_mean_ms", "waking_age_mean_slots", "min_distance_m", "efficiency_mean", "completion_time_s",
 )  # fmt: skip
@@ -97,13 +67,12 @@ class Group:
         return statistic.value, statistic.low, statistic.high
 
     def texts(self, measure: str, dash: str = "–") -> tuple[str, str]:
-        """Value and interval as text; a dash and nothing if no run counts."""
+        """Value and interval as text; a dash and nothing if no run counts, no interval if one does."""
         if measure == CRASHED:
             return share_texts(self.crashed, dash)
         mean, digits = self.mean(measure), MEASURES[measure].digits
-        if not mean.count:
-            return dash, ""
-        return f"{mean.value:.{digits}f}", f"{mean.low:.{digits}f}{dash}{mean.high:.{digits}f}"
+        value, *ends = (f"{number:.{digits}f}" for number in (mean.value, mean.low, mean.high))
+        return value if mean.count else dash, dash.join(ends) if mean.count > 1 else ""
 
     def flat(self) -> Row:
         """One row of plain values: labels, how the flights ended, and means with their intervals."""
@@ -124,7 +93,8 @@ class Group:
             "left_out": self.left_out,
             "crashed": {"count": crashed.count, "of": crashed.total, "low": crashed.low, "high": crashed.high},
             **{
-                name: {"mean": mean.value, "low": mean.low, "high": mean.high, "runs": mean.count}
+                name: {"mean": mean.value, "runs": mean.count}
+                | ({"low": mean.low, "high": mean.high} if mean.count > 1 else {})
                 for name, mean in means.items()
                 if mean.count
             },
@@ -278,7 +248,7 @@ def table_html(table: SweepTable, shown: Sequence[str] = SHOWN, most: int | None
 
 def _interval(point: tuple[float, float, float], low: float, high: float) -> str:
     """A line for the interval, and a dot for the value."""
-    if not math.isfinite(point[0]) or high <= low:
+    if not all(map(math.isfinite, point)) or high <= low:
         return ""
     x, begin, end = (4 + 122 * (at - low) / (high - low) for at in point)
     return (

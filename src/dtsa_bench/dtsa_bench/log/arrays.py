@@ -102,6 +102,7 @@ class FlightArrays:
     version: str = ""  # of this project, which recorded it
     is_kept: bool = True  # whether slots were kept at all
     has_end: bool = True  # whether it is known where all were at the end of the last slot
+    unslotted: bool = False  # agents send at any instant: `lost` counts all that did not receive a frame
 
     # -- what it is ---------------------------------------------------------------------------------------------------
     def __len__(self) -> int:

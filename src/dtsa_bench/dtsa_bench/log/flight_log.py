@@ -135,24 +135,25 @@ def log_of_flight(flight: SimulatedFlight) -> FlightLog:
     """What happened in a simulated flight, and what follows from it; without slots if it kept none."""
     arrays = flight.log or SlotWriter(flight.swarm, 0, frames=True).finish()
     config, slots = flight.run.swarm, len(arrays)
-    heard, received = None, arrays.received
+    heard, received, lost = None, arrays.received, arrays.lost
     if flight.accepted is not None:  # who accepted a frame that arrived, received its sender's
-        heard, received = _received_frames(flight, config.agents), received.copy()
+        heard, received, lost = _received_frames(flight, config.agents), received.copy(), lost.copy()
         place = np.cumsum(arrays.sent).reshape(arrays.sent.shape) - 1
         for frame in flight.accepted:
             sender, slot = named_in(frame.data) or (0, 0)
             if 0 < sender <= config.agents and slot <= frame.row and arrays.sent[slot, sender - 1]:
                 received[place[slot, sender - 1]] |= frame.receivers
+        lost[arrays.sent] = config.agents - 1 - received.sum(axis=1)
     start = np.broadcast_to(flight.scenario.start, (1, *arrays.position.shape[1:]))
     return FlightLog(
         name="", settings=flight.run.to_dict(), agents=config.agents, slot_ns=config.slot_ns,
         recorded=np.ones(slots, np.bool_), known=np.ones(arrays.sent.shape, np.bool_),
         start_ns=np.arange(slots) * config.slot_ns, outcome=arrays.outcome, length=arrays.length,
-        data=arrays.data.tobytes(), received=received, lost=arrays.lost, collided=arrays.collided,
+        data=arrays.data.tobytes(), received=received, lost=lost, collided=arrays.collided,
         chosen=arrays.chosen, reason=arrays.reason, digest=arrays.digest, score=arrays.score,
         offset_ns=np.zeros(arrays.sent.shape, np.int64), track=np.concatenate((start, arrays.position)),
         velocity=arrays.velocity, command=arrays.command, goal=arrays.goal, heard=heard, results=flight.summary(),
-        is_kept=flight.log is not None,
+        is_kept=flight.log is not None, unslotted=heard is not None,
     )  # fmt: skip
 
 

@@ -43,7 +43,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("time_s", "s", "start of that slot"),
         ("sender", "", "id of the agent that sent it"),
         ("received", "1", "agents that received it"),
-        ("lost", "1", "agents that lost it to noise (merged: that did not receive it, for whatever reason)"),
+        ("lost", "1", "agents that lost it to noise (merged, or without slots: that did not receive it)"),
         ("collided", "1", "agents at which it collided with another frame; empty: not known"),
         ("length", "byte", "length of the frame"),
         ("data", "", "the frame, hexadecimal"),
@@ -151,7 +151,7 @@ def _frames(log: FlightArrays) -> Columns:
     unknown = np.isnan(c_r)
     return (
         frames.row, log.time_s(frames.row), frames.sender, frames.received.sum(axis=1), frames.lost,
-        _masked(frames.collided, np.full(len(frames.row), log.merged is not None)),
+        _masked(frames.collided, np.full(len(frames.row), log.merged is not None or log.unslotted)),
         np.array([len(data) for data in frames.data], np.int64), np.array([data.hex() for data in frames.data], object),
         _masked(np.where(unknown, -1, c_r).astype(np.int64), unknown), *vectors,
     )  # fmt: skip

@@ -164,7 +164,7 @@ def _fly_unslotted(
         swarm.end(slot)
         over = metrics.update(slot, swarm.track, swarm, carried.outcome, carried.lengths)
         if log is not None:
-            nothing = (0,) * len(carried.senders)
-            log.close_slot(slot, Verdict(carried.outcome, carried.senders, None, nothing, nothing))
+            nobody, nothing = np.zeros((len(carried.senders), len(swarm.ids)), np.bool_), (0,) * len(carried.senders)
+            log.close_slot(slot, Verdict(carried.outcome, carried.senders, nobody, nothing, nothing))
         slot += 1
     return None if log is None else accepted

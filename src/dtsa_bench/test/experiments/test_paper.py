@@ -17,8 +17,8 @@ import dtsa
 from dtsa_bench.commands.cli import main
 from dtsa_bench.experiments import provenance
 from dtsa_bench.experiments.batch import run_all
-from dtsa_bench.experiments.sweep import make_sweep
-from dtsa_bench.experiments.tables import MEASURES, SHOWN, SweepTable, latex_text, table_html, table_text
+from dtsa_bench.experiments.sweep import MEASURES, make_sweep
+from dtsa_bench.experiments.tables import SHOWN, SweepTable, latex_text, table_html, table_text
 
 AXES = {"loss": [0.0, 0.2], "scheme": {"a_b & 100 %": {"policy": "tdma"}, "lease <b>": {"policy": "lease"}}}
 BASE = {"agents": 6, "timeout_s": 6.0}

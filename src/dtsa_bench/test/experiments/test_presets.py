@@ -18,7 +18,7 @@ from dtsa_bench.pages.report.tables import write_report
 
 NAMED = (
     *("paper-12", "paper-18", "limits", "grid", "idle", "epsilon", "loss", "loss-idle"),
-    *("estimate", "trajectories", "scenarios", "access", "bounds"),
+    *("estimate", "trajectories", "scenarios", "access", "bounds", "waking"),
 )
 
 VOCABULARIES = {"http://www.w3.org", "http://creativecommons.org", "http://purl.org", "https://matplotlib.org"}

@@ -75,8 +75,16 @@ def test_axes_are_combined_and_names_may_be_of_any_section() -> None:
     ({"axes": {"agents": [6, -3]}}, "agents"), ({"axes": {"x": {"a": {"nothing": 1}}}}, "nothing"),
     ({"axes": {"channel": {"a": {"loss": 1.5}}}}, "loss"), ({"base": {"timeout": 3}}, "timeout"),
     ({"base": []}, "base"), ({"seeds": 0}, "seeds"), ({"seeds": ["a"]}, "seeds"),
-    ({"figures": [{"kind": "pie"}]}, "figures[0].kind"),
-    ({"figures": [{"kind": "bars", "x": "moving", "y": []}]}, "figures[0].x"), ({"color": "red"}, "color"),
+    ({"color": "red"}, "color"),
+    *(({"figures": [figure]}, f"figures[0].{name}") for figure, name in (
+        ({"kind": "pie"}, "kind"), ({"kind": ["bars"]}, "kind"), ({"kind": "trajectories"}, "facets"),
+        ({"kind": "bars", "x": "moving", "y": []}, "x"), ({"kind": "bars", "x": "policy", "y": []}, "y"),
+        ({"kind": "bars", "x": "policy"}, "y"), ({"kind": "bars", "x": "policy", "y": ["speed"]}, "y"),
+        ({"kind": "bars", "x": "policy", "y": ["crashed"], "facets": "channel"}, "facets"),
+        ({"kind": "bars", "x": "policy", "y": ["crashed"], "log": "crashed"}, "log"),
+        ({"kind": "bars", "x": "policy", "y": ["crashed"], "name": "../x"}, "name"),
+        ({"kind": "lines", "x": "policy", "y": ["crashed"]}, "x"), ({"kind": "matrix", "rows": "policy"}, "columns"),
+    )),
 ])  # fmt: skip
 def test_what_is_wrong_is_named_before_anything_flies(changes: dict[str, Any], field: str) -> None:
     with pytest.raises(ConfigError) as caught:

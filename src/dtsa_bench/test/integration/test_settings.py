@@ -20,8 +20,7 @@ from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_bench.crazyflies.simulated import FleetConfig
 from dtsa_bench.experiments import sweep as spec
-from dtsa_bench.experiments.sweep import RESERVED
-from dtsa_bench.experiments.tables import MEASURES
+from dtsa_bench.experiments.sweep import MEASURES, RESERVED
 from dtsa_bench.runs.config import LOCKSTEP, MODES, RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 

@@ -95,6 +95,13 @@ def test_rules_that_cannot_be_are_named(answer: Any, text: str) -> None:
         sends(7.0, 1 * MS, 1 * MS + TURN, answer=answer)
 
 
+def test_the_log_says_which_agents_received_a_frame() -> None:
+    flight = dtsa.simulate(policy="beacons", agents=4, moving=2, loss=0.5, seed=1)
+    assert flight.receptions["received"].mean() == pytest.approx(0.5, abs=0.06)
+    assert (flight.frames["received"] + flight.frames["lost"] == 3).all()
+    assert flight.frames["collided"].isna().all()
+
+
 @pytest.mark.parametrize("scheme", ["csma", "mixer"])
 def test_tables_of_a_flight_that_is_over_do_not_wait_for_the_garbage_collector(scheme: str) -> None:
     swarm = make_swarm(SwarmConfig(agents=3, policy=scheme))

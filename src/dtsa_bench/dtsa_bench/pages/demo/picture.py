@@ -136,11 +136,11 @@ def step_text(number: int, flights: Flights) -> tuple[str, str]:
         )
     live = flights["killed-lease"]
     killed, _, back = killed_slots(live)
-    later = "" if back is None else f" {(back - killed) * live.flight.run.swarm.slot_s:.1f} s later"
+    after = "" if back is None else f" {(back - killed) * live.flight.run.swarm.slot_s:.1f} s after it was killed"
     return (
         "One is killed in flight, and comes back.",
         f"The turns of quadcopter {KILLED} stay empty until the others take it for dead; then the next one alive uses "
-        f"them. Started again it listens, speaks{later}, and has its turns back.",
+        f"them. Started again it listens, speaks{after}, and has its turns back.",
     )
 
 

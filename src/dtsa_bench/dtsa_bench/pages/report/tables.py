@@ -11,8 +11,10 @@ from markupsafe import Markup
 from dtsa_bench.drawing.style import save, themed
 from dtsa_bench.experiments.charts import draw, league_scores
 from dtsa_bench.experiments.league import HEADS, STAR, LeagueTable
+from dtsa_bench.experiments.paper import seeds_text
 from dtsa_bench.experiments.statistics import LEVEL, wilson
-from dtsa_bench.experiments.tables import CRASHED, SweepTable, label_of
+from dtsa_bench.experiments.sweep import CRASHED
+from dtsa_bench.experiments.tables import SweepTable, label_of
 from dtsa_bench.pages.html import render_page, write_page
 
 
@@ -59,7 +61,7 @@ def write_report(table: SweepTable, directory: Path, code: str, command: str = "
     facts = [
         f"{len(table.rows)} of {len(sweep.cells) * len(seeds)} flights",
         f"{len(sweep.cells)} settings",
-        f"{len(seeds)} seeds ({seeds[0]}{f' to {seeds[-1]}' if len(seeds) > 1 else ''})",
+        f"{len(seeds)} seeds ({seeds_text(seeds)})",
         f"code {code}",
     ]
     left_out = sorted(table.left_out().items())
@@ -126,7 +128,7 @@ _NOTES = (
     "still leaves up to {most:.0f} %.",
     "Distances, efficiencies and times are those of completed flights without a crash; “counted” says how many those "
     "are. Ages and errors are those of all flights.",
-    "Equal seeds mean equal scenarios, so differences between schemes are taken seed by seed.",
+    "Equal seeds mean equal scenarios: compare schemes seed by seed, with the rows of results.csv.",
     "A scheduler is to blame or to praise only where the estimator is the same, and where the oracle, which knows "
     "everything, does not crash.",
 )
