@@ -82,7 +82,7 @@ def test_death_new_use_and_return_are_found(flights: dict[str, FinishedFlight]) 
     ends = [((KILLED,), ()), ((), (KILLED + 1,)), ((KILLED + 1,), (KILLED,))]
     assert [(turn[0], turn[-1]) for turn in turns] == ends
     assert "by 4" in used[0]
-    assert "7.2 s" in step_text(4, flights)[1]
+    assert "speaks 7.2 s after it was killed" in step_text(4, flights)[1]
 
 
 def test_picture_has_all_colours_and_animation_is_small_and_moves(flights, tmp_path):
