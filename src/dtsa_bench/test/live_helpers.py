@@ -25,13 +25,14 @@ from typing import Any
 from waiting import wait_for
 
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.crazyflie.addresses import Address, parse_address
 from dtsa_agent.crazyflie.onboard import key_of
 from dtsa_bench.crazyflies.peer_lab import App, Laboratory, LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.laboratory import ADDRESS, TICK_NS
 from dtsa_bench.crazyflies.peer_lab.onboard import OnboardSwarm
 from dtsa_bench.crazyflies.peer_lab.record import Observer, PeerPacket
 from dtsa_bench.crazyflies.simulated import crtp
-from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
+from dtsa_bench.crazyflies.simulated.fleet_config import RadioSettings
 from dtsa_bench.crazyflies.simulated.radio.air import BROADCAST, PEER_PORT, Tuning
 from dtsa_bench.crazyflies.simulated.radio.side import RadioServer
 from dtsa_channel_sim.model.medium import OnAir
@@ -41,10 +42,8 @@ BEHIND_NS = 20_000_000  # caught up at once; what is more is lost
 APP_CHANNEL = 2  # of CRTP's platform port
 
 
-def station(settings: LabSettings, agent: int) -> RadioAddress:
-    address = (ADDRESS + agent).to_bytes(5, "big")
-    uri = f"radio://0/{settings.channel}/{settings.rate}/{address.hex().upper()}"
-    return RadioAddress(uri, settings.channel, settings.rate, address)
+def station(settings: LabSettings, agent: int) -> Address:
+    return parse_address(f"radio://0/{settings.channel}/{settings.rate}/{ADDRESS + agent:010X}")
 
 
 class LiveLaboratory(Laboratory):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import math
 import os
 import tempfile
 import threading
@@ -27,6 +28,7 @@ from .state import OFF, WATCHED, State, VehicleState
 from .vehicle import CrazyflieVehicle
 
 TICK_S = 0.02
+STALLED_S = 0.5  # between two ticks: the process stood still, and has not received the heartbeats that came meanwhile
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
 
 
@@ -54,13 +56,13 @@ def own_addresses(robots: Iterable[tuple[str, str]]) -> ExitStack:
 class Bridge:
     """The swarm. Its own thread applies the safety rules 50 times a second.
 
-    :param on_state: called with a vehicle and each new state of it, in a thread of the link's.
+    :param on_state: called with a vehicle, its new state, and when that was measured (s, monotonic), by the link.
     :raises ConfigError: cflib is missing, or the radios cannot carry the swarm.
     """
 
     def __init__(
         self, settings: SwarmSettings, log: Callable[[str, str], None],
-        on_state: Callable[[CrazyflieVehicle, VehicleState], None] | None = None,
+        on_state: Callable[[CrazyflieVehicle, VehicleState, float], None] | None = None,
     ) -> None:  # fmt: skip
         self.settings = settings
         station = settings.station
@@ -81,6 +83,7 @@ class Bridge:
         self.radios = DongleSet(((r.name, r.address) for r in settings.robots), log)
         self.monitor = SafetyMonitor(station.safety)
         self.heartbeat: float | None = None  # s, monotonic: the ground station's last; its silence stops the swarm
+        self.ends = False  # it brings all down by itself: heartbeats, or their silence, do not count any more
         self._failing: dict[Callable[..., Any], str] = {}  # parts of the rules: why
         self._closing = threading.Event()
         self._guard = threading.Thread(target=self._run_rules, name="safety", daemon=True)
@@ -153,15 +156,17 @@ class Bridge:
             vehicle.stop(reason)
 
     def _run_rules(self) -> None:
-        keep_alive, vehicles = 0.0, self.vehicles.values()
+        keep_alive, vehicles, awake, last = 0.0, self.vehicles.values(), -math.inf, time.monotonic()
         while not self._closing.wait(TICK_S):
             now = time.monotonic()
+            awake, last = now if now - last > STALLED_S else awake, now
             if now >= keep_alive:
-                keep_alive = now + 1.0 / WATCHDOG_HZ
+                keep_alive = now + 1.0 / WATCHDOG_HZ - TICK_S
                 for vehicle in vehicles:
                     self._attempt(vehicle.feed_watchdog, now)
             states = [self._attempt(vehicle.watched_state, now) for vehicle in vehicles]
-            age = None if self.heartbeat is None else now - self.heartbeat
+            heartbeat = None if self.ends else self.heartbeat
+            age = None if heartbeat is None else now - max(heartbeat, awake)
             for required in self._attempt(self.monitor.check, now, list(filter(None, states)), age) or ():
                 self._attempt(self._carry_out, required, now)
             for vehicle in vehicles:

@@ -28,7 +28,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import cflib.crtp
 from cflib.crtp.crtpdriver import CRTPDriver
@@ -48,7 +48,8 @@ EMERGENCY, WATCHDOG = (b"\x91\x03", b"\x61\x03"), (b"\x91\x04", b"\x61\x04")
 END_OF_STREAM, HIGH_LEVEL, LEGACY_SETPOINT = 0x71, 0x80, 0x30
 DEAF_S = 0.25  # nothing acknowledged for that long, though the dongle asks all the time
 MOST = {COMMAND: 20, REQUEST: None, SETPOINT: 1, POSITION: 1}  # that wait: of some the newest alone
-LIFE_S = {COMMAND: 1.0, REQUEST: math.inf, SETPOINT: DEAF_S, POSITION: DEAF_S}  # what waited longer comes unexpected
+# What has waited longer comes unexpected, whether it was sent or not.
+LIFE_S = {COMMAND: 1.0, REQUEST: math.inf, SETPOINT: DEAF_S, POSITION: DEAF_S, EMPTY: math.inf}
 RELAXED_S, BUSY_POLLS = 0.01, 10  # pause between polls once so many in a row were answered with nothing
 ABSENT_S, ABSENT_POLL_S = 1.0, 0.02  # pause between polls of one that has not answered for that long
 REOPEN_S = 0.3  # between attempts to find a dongle that has gone
@@ -68,12 +69,24 @@ def kind_of(packet: bytes) -> str:
     return COMMAND if header in (END_OF_STREAM, HIGH_LEVEL, 0x91, 0x61, 0xD0) else REQUEST
 
 
+class WaitingPacket(NamedTuple):
+    """A packet that is to be sent, or to be acknowledged."""
+
+    kind: str
+    data: bytes
+    since: float  # s, monotonic
+
+    def has_expired(self, now: float) -> bool:
+        """Whether it does not count any more; an emergency stop always does."""
+        return now - self.since >= LIFE_S[self.kind] and not (self.kind == COMMAND and self.data[1:2] == b"\x03")
+
+
 class Mailbox:
-    """What one Crazyflie is to be sent, by kind, with when it came (s, monotonic). For any thread."""
+    """What one Crazyflie is to be sent, by kind. For any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.waiting: dict[str, deque[tuple[bytes, float]]] = {kind: deque(maxlen=n) for kind, n in MOST.items()}
+        self.waiting: dict[str, deque[WaitingPacket]] = {kind: deque(maxlen=n) for kind, n in MOST.items()}
         self._turns = [SETPOINT, REQUEST, POSITION]
 
     def add(self, packet: bytes) -> None:
@@ -82,25 +95,26 @@ class Mailbox:
         with self._lock:
             if start in EMERGENCY:
                 self.waiting[REQUEST].clear()
-                for other in [entry for entry in commands if entry[0] != packet]:
+                for other in [entry for entry in commands if entry.data != packet]:
                     commands.remove(other)
             if start in EMERGENCY or start[0] in (END_OF_STREAM, HIGH_LEVEL):
                 self.waiting[SETPOINT].clear()
-            if start not in WATCHDOG or all(packet != waiting for waiting, _ in commands):
-                self.waiting[kind_of(packet)].append((packet, time.monotonic()))
+            if start not in WATCHDOG or all(packet != waiting.data for waiting in commands):
+                kind = kind_of(packet)
+                self.waiting[kind].append(WaitingPacket(kind, packet, time.monotonic()))
 
-    def pop(self, kind: str = "") -> tuple[str, bytes] | None:
-        """Return the next packet, of one kind or of any, and its kind; None: there is none."""
+    def pop(self, kind: str = "") -> WaitingPacket | None:
+        """Return the next packet, of one kind or of any; None: there is none."""
         with self._lock:
             now = time.monotonic()
             for turn in [kind] if kind else [COMMAND, *self._turns]:
                 while self.waiting[turn]:
-                    packet, since = self.waiting[turn].popleft()
-                    if now - since < LIFE_S[turn] or (turn == COMMAND and packet[1:2] == b"\x03"):
+                    packet = self.waiting[turn].popleft()
+                    if not packet.has_expired(now):
                         if turn != COMMAND:
                             self._turns.remove(turn)
                             self._turns.append(turn)
-                        return turn, packet
+                        return packet
         return None
 
 
@@ -116,7 +130,7 @@ class RadioDriver(CRTPDriver):  # type: ignore[misc]
         self._radios = radios
         self._dongle: DongleThread | None = None
         self._arrived: queue.Queue[Any] = queue.Queue()
-        self._pending: tuple[str, bytes] | None = None  # sent, and not acknowledged
+        self._pending: WaitingPacket | None = None  # sent, and not acknowledged
         self._tries, self._safelink, self._up, self._down = 0, False, 0, 0
         self._last = self._least_s = 0.0  # s: when a packet last went (monotonic), and shortest time between two
         self._acknowledged = -math.inf  # s, monotonic
@@ -191,18 +205,18 @@ class RadioDriver(CRTPDriver):  # type: ignore[misc]
         """Return the packet to send, and whether with either bit."""
         box, pending, both = self.mailbox, self._pending, False
         if pending is None:
-            pending = box.pop() or (EMPTY, NULL)
+            pending = box.pop() or WaitingPacket(EMPTY, NULL, now)
         elif now - self._acknowledged > DEAF_S:
             if (command := box.pop(COMMAND)) is not None:
-                if pending[0] == REQUEST:  # it may not have arrived
-                    box.waiting[REQUEST].appendleft((pending[1], now))
+                if pending.kind == REQUEST:  # it may not have arrived
+                    box.waiting[REQUEST].appendleft(pending)
                 pending, both = command, True
-            elif pending[0] in (SETPOINT, POSITION):
-                pending = EMPTY, NULL  # too old
-        elif pending[0] in (SETPOINT, POSITION):
-            pending = box.pop(pending[0]) or pending
+            elif pending.kind in (SETPOINT, POSITION) or pending.has_expired(now):
+                pending = WaitingPacket(EMPTY, NULL, now)
+        elif pending.kind in (SETPOINT, POSITION):
+            pending = box.pop(pending.kind) or pending
         self._pending = pending
-        return pending[1], both
+        return pending.data, both
 
     def _answered(self, data: bytes, repeated: int, greeting: bool) -> None:
         self._scores.append(10 - repeated)
@@ -212,7 +226,7 @@ class RadioDriver(CRTPDriver):  # type: ignore[misc]
             self._safelink, fresh = data == SAFELINK, False
             self.needs_resending = not self._safelink
         else:
-            kind, self._pending = self._pending[0] if self._pending else EMPTY, None
+            kind, self._pending = self._pending.kind if self._pending else EMPTY, None
             if self._safelink:
                 fresh = fresh and data[0] & DOWN_BIT == self._down * DOWN_BIT
                 self._up, self._down = 1 - self._up, 1 - self._down if fresh else self._down

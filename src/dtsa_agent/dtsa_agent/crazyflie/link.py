@@ -352,7 +352,7 @@ class CrazyflieLink:
         if cf is not None:
             with contextlib.suppress(Exception):  # whatever state it is in, we are done with it
                 cf.close_link()
-        self.driver, self.acknowledged = None, -math.inf
+        self.driver, self.acknowledged, self._log_delay = None, -math.inf, math.inf
 
     def close(self) -> None:
         """Close the connection. Never in flight."""

@@ -34,7 +34,7 @@ from .state import Vector
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 TRAILING_NUMBER = re.compile(r"\d+$")
-MAX_START_OFFSET_M = 0.25  # of an agent on board from its start in the scenario
+MAX_START_OFFSET_M = 0.25  # of a vehicle from its initial_position, and of that from where an agent on board starts
 SECTIONS = ("fileversion", "robots", "robot_types", "all", "station")
 
 

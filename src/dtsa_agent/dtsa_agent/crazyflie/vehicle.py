@@ -58,12 +58,12 @@ class CrazyflieVehicle:
     """One Crazyflie. Times (`now`) are s, monotonic; places are m, world. Orders return why not, or an empty text.
 
     :param cache: folder for cflib's tables.
-    :param on_state: called with this vehicle and each new state of it, in a thread of cflib's.
+    :param on_state: called with this vehicle, its new state, and when that was measured, in a thread of cflib's.
     """
 
     def __init__(
         self, robot: RobotSettings, station: GroundStationSettings, cache: Path, log: Callable[[str, str], None],
-        on_state: Callable[[CrazyflieVehicle, VehicleState], None] | None = None,
+        on_state: Callable[[CrazyflieVehicle, VehicleState, float], None] | None = None,
     ) -> None:  # fmt: skip
         self.robot, self.station, self.name = robot, station, robot.name
         self.lock = threading.RLock()  # protects all of it
@@ -130,7 +130,7 @@ class CrazyflieVehicle:
                 if before == State.LOST != self.state:
                     self._resume_after_gap(state)
         if self._publish is not None:
-            self._publish(self, state)
+            self._publish(self, state, now)
 
     def _resume_after_gap(self, state: VehicleState) -> None:
         """The end of a gap: the orders that were given in it may have been lost."""
@@ -409,6 +409,7 @@ class CrazyflieVehicle:
             self.action = f"emergency stop: {reason}"
             self._overruled = True
             self._steady = self._order = None
+            self._landings.clear()
             for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
                 self.link.order(lambda cf: cf.supervisor.send_emergency_stop())
             self.machine.note_emergency_stop(self.action)

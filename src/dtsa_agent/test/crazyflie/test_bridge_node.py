@@ -5,11 +5,13 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
@@ -25,11 +27,14 @@ from dtsa_msgs.msg import Position, Status, VelocityWorld  # noqa: E402
 from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff  # noqa: E402
 from geometry_msgs.msg import Point  # noqa: E402
 from graph_helpers import COUNT, Graph  # noqa: E402
+from std_msgs.msg import Empty as EmptyMessage  # noqa: E402
 from std_srvs.srv import Empty, Trigger  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
 from dtsa_agent.crazyflie.node import bridge_node  # noqa: E402
-from dtsa_agent.crazyflie.state import State  # noqa: E402
+from dtsa_agent.crazyflie.node.topics import VehicleOutputs  # noqa: E402
+from dtsa_agent.crazyflie.positions import PositionSettings  # noqa: E402
+from dtsa_agent.crazyflie.state import State, VehicleState  # noqa: E402
 from dtsa_bench.flights.domain import ros_domain  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
@@ -37,7 +42,7 @@ PATIENT = {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}}  # not what is 
 
 
 @contextmanager
-def swarm(tmp_path: Path, **station: float) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Graph]]:
+def swarm(tmp_path: Path, **station: Any) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Graph]]:
     with ros_domain() as domain, fake_fleet(tmp_path, COUNT, "--arming", "mixed") as fleet:
         config = tmp_path / "swarm.yaml"
         data = settings(fleet, PATIENT | station)
@@ -64,10 +69,54 @@ def refused_commands(graph: Graph, k: int) -> int:
     return next(int(v.value) for v in values if v.key == "commands refused")
 
 
+@contextmanager
+def heartbeats(graph: Graph) -> Iterator[None]:
+    """The ground station's, ten a second."""
+    publisher, over = graph.node.create_publisher(EmptyMessage, "/all/heartbeat", 1), threading.Event()
+
+    def beat() -> None:
+        while not over.wait(0.1):
+            publisher.publish(EmptyMessage())
+
+    thread = threading.Thread(target=beat)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_odometry_is_dated_by_when_its_values_were_taken() -> None:
+    """A packet waits for its turn on the air, and for the end of a gap: agents move a vehicle on by its age."""
+    late_s, vehicle = 0.5, SimpleNamespace(state=State.READY)
+    report = VehicleState((1.0, 0.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 4.0, 0)
+    with ros_domain() as domain, closing(Graph(domain)) as graph:
+        outputs = VehicleOutputs(graph.node, "cf1", PositionSettings())
+        outputs._reported, outputs._odom_wanted = State.READY, True
+
+        def received() -> bool:
+            outputs.publish_report(vehicle, report, time.monotonic() - late_s)  # type: ignore[arg-type]
+            return "/cf1/odom" in graph.last
+
+        wait_for(received)
+        stamp = graph.last["/cf1/odom"].header.stamp
+        assert time.time() - (stamp.sec + stamp.nanosec * 1e-9) >= late_s
+
+
 @pytest.mark.realtime
 def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
-    with swarm(tmp_path) as (fleet, process, graph):
+    safety = PATIENT["safety"] | {"emergency_watchdog": False}
+    with swarm(tmp_path, safety=safety) as (fleet, process, graph):
         up(graph)
+        with heartbeats(graph):  # the bridge stands still: it has missed heartbeats that were sent, and stops nobody
+            wait_for(lambda: graph.node.count_subscribers("/all/heartbeat"))
+            time.sleep(0.3)
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(1.3)
+            process.send_signal(signal.SIGCONT)
+            time.sleep(0.3)
+        assert graph.call(Trigger, "/all/end_heartbeat").success
         odometry = graph.last["/cf1/odom"]
         assert (odometry.header.frame_id, odometry.child_frame_id) == ("world", "cf1/base_link")
         assert graph.last["/cf1/pose"].header.frame_id == "world"
@@ -129,7 +178,10 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         answer = graph.call(Land, "/cf3/land", height=0.0, duration=Duration(nanosec=200_000_000))
         assert answer.success
         assert "cf3: landing takes" in answer.message
-        process.send_signal(signal.SIGINT)
+        with heartbeats(graph):  # of a ground station that ends a moment later: that stops nobody on the way down
+            time.sleep(0.3)
+            process.send_signal(signal.SIGINT)
+            wait_for(lambda: all(fleet.events(k, "land") for k in (1, 2, 3)))
         output, _ = process.communicate(timeout=60)
         assert process.returncode == 0, output
         assert "landing" in output
@@ -140,8 +192,8 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         assert not [e for e in fleet.events() if e["event"] in ("hard landing", "collision", "crash")]
 
 
-@pytest.mark.parametrize(("state", "code"), [(State.READY, 0), (State.LOST, 1)])
-def test_one_that_is_lost_on_the_way_down_is_named_at_the_end(state: State, code: int) -> None:
+@pytest.mark.parametrize(("state", "code"), [(State.READY, 0), (State.LOST, 1), (State.EMERGENCY, 1)])
+def test_one_that_is_lost_or_falls_on_the_way_down_is_named_at_the_end(state: State, code: int) -> None:
     bridge, said = MagicMock(), []
     bridge.names_in_air.return_value = ["cf1", "cf2"]
     bridge.wait_landed.return_value = []

@@ -124,6 +124,16 @@ def test_an_emergency_stop_reaches_all_that_listen(tmp_path: Path) -> None:
         wait_for(lambda: {e["cf"] for e in fleet.events(name="state") if e["state"] == "locked"} == {1, 2, 3, 4}, 5.0)
 
 
+def test_an_order_that_was_sent_into_a_gap_is_dropped_after_a_second(tmp_path: Path) -> None:
+    with radio_flight(tmp_path, 1, {}, "--arming", "required") as (fleet, pilot):
+        fleet.fault("drop", 1, rate=1.0, direction="both", seconds=3.0)
+        assert pilot.bridge.vehicles["cf1"].arm(True) == ""
+        wait_for(lambda: pilot.state(1) == State.LOST, 5.0)
+        wait_for(lambda: pilot.state(1) != State.LOST, 10.0)
+        assert pilot.state(1) == State.READY
+        assert not fleet.events(1, "armed")
+
+
 @pytest.mark.realtime
 def test_gaps_of_the_air(tmp_path: Path) -> None:
     """One gap a vehicle while commands are streamed, all at one time."""

@@ -160,7 +160,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     path = Path(args.config)
     settings = load_swarm(path)
     from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
-    from dtsa_bench.crazyflies.missions.places import mission_defaults
+    from dtsa_bench.crazyflies.missions.places import MissionError, mission_defaults
 
     if getattr(args, "run.mode") is None:
         setattr(args, "run.mode", "realtime")
@@ -170,11 +170,15 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     options = FlightOptions(domain=domain, pictures=args.picture)
     page = page_options(args)
     with Stop() as stop:
-        flight, cut_short = fly_crazyflies(
-            config, settings, path, args.out, options, stop, attach=args.attach, page=page
-        )
+        try:
+            flight = fly_crazyflies(config, settings, path, args.out, options, stop, attach=args.attach, page=page)
+        except MissionError as error:
+            if not stop:
+                raise
+            warn(f"no exchange: {error}")
+            return INTERRUPTED
     _print_result(args, flight)
-    unheard = _report_missing_frames(flight.summary)
+    unheard, cut_short = _report_missing_frames(flight.summary), flight.summary["cut_short"]
     not_landed = [] if stop and not cut_short else flight.summary.get("not_landed", [])
     if problem := mission_problem(cut_short, not_landed):
         warn(problem)

@@ -176,7 +176,13 @@ def test_places_and_rates_for_a_mission_are_printed_and_all_that_are_wrong_are_n
     assert budget.endswith(": fits")
     robots = load_swarm(config).robots
     assert (len(robots), robots[0].log_rate_hz) == (10, 15)
+    assert main(["bridge", "--places", "14"]) == 2  # one dongle carries them at 6 Hz, which none can fly with
+    fly = ["fly", "--backend", "cflib", "--config", str(config), "--out", str(tmp_path / "out")]
     data = yaml.safe_load(config.read_text())
+    config.write_text(yaml.safe_dump(data | {"all": {"command_rate_hz": 6}}))
+    capsys.readouterr()
+    assert main(fly) == 2
+    assert "robots.cf1.command_rate_hz: got 6" in capsys.readouterr().err
     for robot in data["robots"].values():
         del robot["initial_position"]
     data["robots"]["cf10"]["role"] = "leader"
@@ -185,7 +191,7 @@ def test_places_and_rates_for_a_mission_are_printed_and_all_that_are_wrong_are_n
     lines = capsys.readouterr().out.splitlines()
     assert len([line for line in lines if line.startswith("for a mission: initial_position: cf")]) == 10
     assert "not used: robots.cf10.role" in lines
-    assert main(["fly", "--backend", "cflib", "--config", str(config), "--out", str(tmp_path / "out")]) == 2
+    assert main(fly) == 2
     (error,) = capsys.readouterr().err.strip().splitlines()
     assert all(f"cf{k} within 0.25 m of (" in error for k in range(1, 11))
 

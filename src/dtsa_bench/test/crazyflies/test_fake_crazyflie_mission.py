@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,9 +29,13 @@ pytest.importorskip("dtsa_msgs.srv")
 import aiohttp
 from bridge_helpers import FakeFleet, fake_fleet, settings
 from ground_helpers import children_of, running
-from node_helpers import node_environment
+from node_helpers import ServedNode, node_environment
+from rclpy.context import Context
+from rclpy.node import Node
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from std_msgs.msg import Empty as EmptyMessage
+from std_srvs.srv import Trigger
 from waiting import wait_for
 
 from dtsa_agent.core import SwarmConfig, make_scenario
@@ -39,8 +43,11 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.node.interfaces import STATE
 from dtsa_agent.crazyflie.safety import SafetySettings
+from dtsa_agent.crazyflie.settings import parse_swarm
+from dtsa_agent.ros.common.node_process import init_ros
 from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import mission_problem
+from dtsa_bench.crazyflies.missions.ground_station import GroundStation
 from dtsa_bench.crazyflies.missions.mission_flight import MissionWatch
 from dtsa_bench.crazyflies.missions.places import MissionError, assign_places, check_crossings, check_standing
 from dtsa_bench.crazyflies.simulated.truth import read_truth
@@ -293,6 +300,36 @@ def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -
         assert nearest_m(others[others[:, 2].min(axis=1) > 0.5]) > 0.25
 
 
+def test_no_heartbeat_follows_the_last_word_of_a_ground_station(tmp_path: Path) -> None:
+    """A bridge that goes on would take the silence after it for a ground station that has died."""
+    received: list[str] = []
+
+    def end(request: Any, response: Any) -> Any:
+        received.append("end")
+        time.sleep(0.3)
+        return response
+
+    config, context = SwarmConfig(agents=2), Context()
+    with ros_domain() as domain, closing(ServedNode(domain, "bridge")) as bridge:
+        bridge.node.create_subscription(EmptyMessage, "/all/heartbeat", lambda message: received.append("beat"), 10)
+        bridge.node.create_service(Trigger, "/all/end_heartbeat", end)
+        init_ros([], context, domain)
+        node = Node("mission", context=context, enable_rosout=False, start_parameter_services=False)
+        robots = parse_swarm({"robots": {"cf1": {"uri": "udp://127.0.0.1:9001"}}})
+        ground = GroundStation(node, robots, make_scenario(config), StopToken(Stop()), print)
+        try:
+            ground._beating.set()
+            wait_for(lambda: ground._clients["/all/end_heartbeat"].service_is_ready() and "beat" in received)
+            ground.land(lambda: False)
+            wait_for(lambda: "end" in received)
+            time.sleep(0.5)
+        finally:
+            ground.close()
+            node.destroy_node()
+            context.try_shutdown()
+    assert received[-1] == "end"
+
+
 def test_bad_input_starts_nothing(tmp_path: Path) -> None:
     out = str(tmp_path / "out")
     robots = {f"cf{k}": {"uri": f"udp://127.0.0.1:{9000 + k}"} for k in range(1, 5)}
@@ -317,7 +354,8 @@ def test_without_cflib_the_bridge_says_how_to_get_it(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.realtime
-def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
+@pytest.mark.parametrize("phase", ["takeoff", "streaming"])
+def test_ctrl_c_lands_and_a_second_one_stops(phase: str, tmp_path: Path) -> None:
     """The vehicles have names of their own."""
     with fake_fleet(tmp_path, 2, *MIXED) as fleet:
         config = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45)
@@ -326,12 +364,14 @@ def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
         data["station"]["max_speed_mps"] = 0.2  # a landing takes ten seconds: the second signal comes before its end
         config.write_text(yaml.safe_dump(data, sort_keys=False))
         with mission("--config", str(config), "--out", str(tmp_path / "out")) as process:
-            wait_for(lambda: streaming(fleet), 60)
+            wait_for(lambda: len(fleet.events(name=phase)) == 2, 60)
             process.send_signal(signal.SIGINT)
             wait_for(lambda: len(fleet.events(name="land")) == 2, 20)
             assert not any(e["state"] == "locked" for e in fleet.events(name="state"))
             process.send_signal(signal.SIGINT)
             process.communicate(timeout=60)
         assert process.returncode == 130
+        if phase == "takeoff":  # the mission did not go on to fly them to their places
+            assert not fleet.events(name="go_to")
         for k in (1, 2):
             assert fleet.state_event(k, "locked")["reason"] == "emergency stop"

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from dtsa_agent.crazyflie import addresses as budget
-from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
+from dtsa_agent.crazyflie.addresses import Address
+from dtsa_bench.crazyflies.simulated.fleet_config import RadioSettings
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
 from dtsa_bench.crazyflies.simulated.radio.air import BITRATES, BROADCAST, RATE_NAMES, RadioAir
 from dtsa_bench.crazyflies.simulated.radio.dongle import DongleModel
@@ -16,17 +17,18 @@ from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, RadioReceiver
 NULL, SAFELINK = b"\xff", b"\xff\x05\x01"
 PACKET = b"\x3c" + bytes(14)
 US = 1000
+SHARED = budget.parse_address("radio://0/80/2M/FFE7E7E7E7")
 TWO = RadioSettings(dongles=2, request_ms=0.0)
 
 
-def station(number: int, channel: int = 80, rate: str = "2M") -> RadioAddress:
-    return RadioAddress.of(f"radio://0/{channel}/{rate}/E7E7E7E7{number:02X}")
+def station(number: int, channel: int = 80, rate: str = "2M") -> Address:
+    return budget.parse_address(f"radio://0/{channel}/{rate}/E7E7E7E7{number:02X}")
 
 
 @dataclass
 class Room:
     settings: RadioSettings = TWO
-    stations: tuple[RadioAddress, ...] = (station(1), station(2))
+    stations: tuple[Address, ...] = (station(1), station(2))
     heard: list[tuple[int, bytes]] = field(default_factory=list)
     deaf: set[tuple[int, bool]] = field(default_factory=set)  # index, up: what a fault stops
 
@@ -42,10 +44,10 @@ class Room:
     def _hears(self, radio: int, up: bool) -> bool:
         return (radio - self.settings.dongles - 1, up) not in self.deaf
 
-    def tune(self, dongle: int, to: RadioAddress) -> None:
+    def tune(self, dongle: int, to: Address) -> None:
         d = self.dongles[dongle]
         d.request(requests.SET_CHANNEL, to.channel, b"", 0)
-        d.request(requests.SET_ADDRESS, 0, to.address, 0)
+        d.request(requests.SET_ADDRESS, 0, bytes.fromhex(to.node), 0)
         d.request(requests.SET_RATE, RATE_NAMES.index(to.rate), b"", 0)
 
     def exchange(self, packet: bytes, at_ns: int = 0, dongle: int = 0) -> list[tuple[int, bytes]]:
@@ -121,7 +123,7 @@ def test_two_dongles_on_one_channel_collide_and_on_two_channels_do_not() -> None
 
 def test_a_broadcast_reaches_all_on_its_channel_and_is_not_answered() -> None:
     room = Room(stations=(station(1), station(2), station(3, 60), station(4, 80, "1M")))
-    room.tune(0, RadioAddress("", 80, "2M", BROADCAST))
+    room.tune(0, SHARED)
     room.dongles[0].request(requests.ACK_ENABLE, 0, b"", 0)
     assert room.exchange(PACKET) == []
     assert room.exchange(PACKET[:16] * 2 + bytes(10)) == [], "more than 32 bytes: two packets"
@@ -152,7 +154,7 @@ def test_the_bridges_budget_is_what_a_dongle_carries(rate: str, count: int) -> N
     while now < 503_000 * US:
         to = exchanges % count
         if count > 1:
-            room.dongles[0].request(requests.SET_ADDRESS, 0, stations[to].address, now)
+            room.dongles[0].request(requests.SET_ADDRESS, 0, room.receivers[to].address, now)
         room.receivers[to].push(bytes((0x5C,)) + bytes(budget.DOWN_BYTES - 1))
         ((now, answer),) = room.exchange(bytes((0x7C,)) + bytes(budget.UP_BYTES - 1), now)
         assert answer[0] & 1
@@ -170,7 +172,6 @@ def test_what_the_devices_cannot_do() -> None:
     assert room.dongles[0].sniffer.tuning is None
 
 
-SHARED = RadioAddress("", 80, "2M", BROADCAST)
 SPOKEN = bytes((0xFF, 0x87)) + bytes(range(60))
 THREE = RadioSettings(dongles=3, request_ms=0.0)
 
@@ -201,7 +202,7 @@ class Ears:
         return [data[7:] for _, data in self.packets]
 
 
-def sniffing(settings: RadioSettings = THREE, stations: tuple[RadioAddress, ...] = ()) -> tuple[Room, list[Ears]]:
+def sniffing(settings: RadioSettings = THREE, stations: tuple[Address, ...] = ()) -> tuple[Room, list[Ears]]:
     room = Room(settings, stations)
     for k in range(settings.dongles):
         room.tune(k, SHARED)
@@ -264,7 +265,7 @@ def test_a_sniffer_hears_its_two_addresses_and_broadcasts_are_not_for_the_ground
     room = Room(THREE, (station(1), station(2)))
     room.tune(0, room.stations[0])
     room.tune(1, room.stations[0])
-    room.dongles[1].request(requests.SET_SNIFFER_ADDRESS, 1, room.stations[1].address, 0)
+    room.dongles[1].request(requests.SET_SNIFFER_ADDRESS, 1, room.receivers[1].address, 0)
     ears = Ears(room.dongles[1], room)
     room.exchange(PACKET)
     room.tune(0, room.stations[1])

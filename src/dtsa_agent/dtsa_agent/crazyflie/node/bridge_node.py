@@ -64,7 +64,7 @@ class BridgeNode(Node):
         self._events = self.create_publisher(Log, EVENTS.lstrip("/"), EVENTS_QOS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._outputs = {r.name: VehicleOutputs(self, r.name, own["positions"]) for r in settings.robots}
-        report = lambda vehicle, state: self._outputs[vehicle.name].publish_report(vehicle, state)  # noqa: E731
+        report = lambda vehicle, *state: self._outputs[vehicle.name].publish_report(vehicle, *state)  # noqa: E731
         self.bridge = Bridge(self.settings, self.log, report)
         self._commands, self.positions = TopicThread(self, "commands"), TopicThread(self, "positions")
         self._inputs = BridgeInputs(self, self.bridge, self._commands, self.log)
@@ -120,7 +120,7 @@ class BridgeNode(Node):
         self._diagnostics.publish(message)
 
 
-def _is_urgent(stop: Stop) -> bool:
+def is_urgent(stop: Stop) -> bool:
     """The first signal lands all; one more Ctrl-C is the emergency stop.
 
     Only that: programs that start processes, like `ros2 launch`, send SIGTERM to those that take long to end.
@@ -169,19 +169,20 @@ def check_bridge(node: BridgeNode, stop: Stop) -> int:
 
 def _end(node: BridgeNode, stop: Stop) -> int:
     bridge = node.bridge
-    bridge.heartbeat = None  # from here on the bridge alone brings them down
+    bridge.ends = True
     flying = first = bridge.names_in_air(time.monotonic())
     if flying:
         node.log("warn", f"landing {', '.join(flying)}; Ctrl-C again stops all motors")
         bridge.land_all("the bridge ends")
-        flying = bridge.wait_landed(lambda: _is_urgent(stop))
-    urgent = _is_urgent(stop)
+        flying = bridge.wait_landed(lambda: is_urgent(stop))
+    ended = [name for name in first if name not in flying]
+    lost = [name for name in ended if bridge.vehicles[name].state in (State.LOST, State.EMERGENCY)]
+    urgent = is_urgent(stop)
     if urgent:
         bridge.stop_all("second Ctrl-C")
         time.sleep(0.3)  # three packets a vehicle, then the links may close
     elif flying:
         node.log("error", f"still flying: {', '.join(flying)}")
-    lost = [name for name in first if name not in flying and bridge.vehicles[name].state == State.LOST]
     if lost:
         node.log("error", f"not known to have landed: {', '.join(lost)}")
     bridge.close()

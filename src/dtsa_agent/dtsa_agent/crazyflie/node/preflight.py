@@ -9,12 +9,11 @@ from collections.abc import Iterable, Iterator
 from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.positions import quantile
 from dtsa_agent.crazyflie.safety import outside_fence
-from dtsa_agent.crazyflie.settings import GroundStationSettings
+from dtsa_agent.crazyflie.settings import MAX_START_OFFSET_M, GroundStationSettings
 from dtsa_agent.crazyflie.state import OFF, State, VehicleState, place_text
 from dtsa_agent.crazyflie.vehicle import CrazyflieVehicle
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
-MAX_START_OFFSET_M = 0.25  # a vehicle farther from its initial_position is reported
 MIN_LINK_QUALITY = 0.8  # share of the log packets that arrive
 MIN_POSE_AGE_MS, MAX_POSE_AGE_MS = -2.0, 100.0  # of motion capture; outside, poses are late or the clocks differ
 MIN_PROTOCOL = 10  # older firmware has no arming requests

@@ -17,6 +17,7 @@ from dtsa_msgs.msg import Status as StateMessage
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -243,18 +244,19 @@ class VehicleOutputs:
         self._message.header.frame_id = FRAME
         self._message.pose.covariance, self._message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
 
-    def publish_report(self, vehicle: CrazyflieVehicle, report: VehicleState) -> None:
+    def publish_report(self, vehicle: CrazyflieVehicle, report: VehicleState, taken: float) -> None:
         """Odometry and pose of one log packet, in the link's thread, if there are subscribers.
 
-        A new state is published at once: other vehicles may fly towards it.
+        They are stamped with when their values were taken (s, monotonic): a packet waits for its turn on the air. A new
+        state is published at once: other vehicles may fly towards it.
         """
-        stamp, message = self._clock.now().to_msg(), self._message
+        now, message = self._clock.now(), self._message
         if vehicle.state != self._reported:
             self._reported = vehicle.state
-            self._state.publish(state_message(vehicle, stamp))
+            self._state.publish(state_message(vehicle, now.to_msg()))
         if not (self._odom_wanted or self._pose_wanted):
             return
-        message.header.stamp = stamp
+        message.header.stamp = (now - Duration(seconds=time.monotonic() - taken)).to_msg()
         p, q = message.pose.pose.position, message.pose.pose.orientation
         p.x, p.y, p.z = report.position
         q.x, q.y, q.z, q.w = report.orientation

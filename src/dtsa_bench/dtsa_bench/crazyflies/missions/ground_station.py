@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -36,7 +36,8 @@ CLIMB_MPS = 0.4
 SHIFT_MPS = 0.3
 BRIDGE_SILENT_S = 3.0
 STOPPING_S = (1.2, 6.0)  # all come to rest within the first time; at the second they land wherever they are
-IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
+FLYING = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING)
+NOT_LANDED = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST, Status.STATE_EMERGENCY)
 BRIDGE_S = 60.0  # s, for the connections
 AGENTS_S = 60.0  # s, for their process
 
@@ -69,7 +70,6 @@ class GroundStation:
         self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
         self._stop_here = node.create_publisher(EmptyMessage, STOP_HERE, 1)
         self._stopping: float | None = None  # s, monotonic, since when they are told to come to rest
-        self._landing: Any = None  # the answer to the order to land
         self._beating = threading.Event()
         self._over = threading.Event()
         # Made long before they are used: a server drops the answer to a client that it has not discovered yet.
@@ -118,7 +118,11 @@ class GroundStation:
         self._pulse.join(2.0)
 
     def call(self, name: str, timeout: float = 10.0, **fields: Any) -> None:
-        """Call a service and wait for its answer (s, at most); MissionError: it does not answer or says no."""
+        """Call a service and wait for its answer (s, at most).
+
+        :raises MissionError: it does not answer or says no, or the user has interrupted.
+        """
+        self._check_goes_on()
         client = self._clients[name]
         future = client.call_async(client.srv_type.Request(**fields))
         end = time.monotonic() + timeout
@@ -130,13 +134,16 @@ class GroundStation:
         if not getattr(future.result(), "success", True):
             raise MissionError(f"{name}: {future.result().message}")
 
+    def _check_goes_on(self) -> None:
+        self.check_bridge_process()
+        if self.ended:
+            raise MissionError(self.ended.reason or "interrupted")
+
     def wait(self, what: str, condition: Callable[[], bool], timeout: float) -> None:
         """Wait until something is so (s, at most); MissionError: it takes too long, or the user interrupts."""
         end = time.monotonic() + timeout
         while not condition():
-            self.check_bridge_process()
-            if self.ended:
-                raise MissionError(self.ended.reason or "interrupted")
+            self._check_goes_on()
             if time.monotonic() > end:
                 missing = [f"{n} {s.state_name} ({s.reason})" for n, s in self.status.items()]
                 raise MissionError(f"{what} took longer than {timeout:g} s: {', '.join(missing)}")
@@ -144,6 +151,9 @@ class GroundStation:
 
     def _all(self, *states: int) -> bool:
         return len(self.status) == len(self.settings.robots) and all(s.state in states for s in self.status.values())
+
+    def _any(self, *states: int) -> bool:
+        return any(s.state in states for s in self.status.values())
 
     def connect(self, config: SwarmConfig) -> SwarmConfig:
         """Wait until the bridge is up and all are ready; the configuration in which all begin near where they stand.
@@ -189,8 +199,8 @@ class GroundStation:
         seconds = max(2.0, height / CLIMB_MPS, shortest_s(height, limit))
         self.report("take-off")
         self.call("/all/takeoff", height=height, duration=_duration(seconds))
-        time.sleep(seconds)
-        self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
+        over = time.monotonic() + seconds
+        self.wait("the take-off", lambda: time.monotonic() > over and self._all(Status.STATE_FLYING), seconds + 5.0)
         way = self._largest_distance_to_start()
         seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))  # for all: their ways keep apart if flown together
         for robot, start in zip(self.settings.robots, self.scenario.start.T.tolist(), strict=True):
@@ -198,7 +208,8 @@ class GroundStation:
             goal = Point(x=x, y=y, z=z)
             self.call(f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
         self.wait("the way to the start", lambda: self._largest_distance_to_start() < ARRIVED_M, seconds + 15.0)
-        time.sleep(0.5)  # the last go_to is flown to its end before streamed commands count
+        over = time.monotonic() + 0.5  # the last go_to is flown to its end before streamed commands count
+        self.wait("the last go_to", lambda: time.monotonic() > over, 1.0)
         # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
         self._serving.executor.create_task(self._forget_odometry)
         self.exchanging = True
@@ -212,9 +223,9 @@ class GroundStation:
         return max(math.dist(self.place[robot.name], start) for robot, start in starts)
 
     @property
-    def flying(self) -> list[str]:
-        """Names of those that were in the air, or may have been, by their last status."""
-        return [name for name, s in sorted(self.status.items()) if s.state in IN_AIR]
+    def not_landed(self) -> list[str]:
+        """Names of those that are in the air, or may be, or fell, by their last status."""
+        return [name for name, s in sorted(self.status.items()) if s.state in NOT_LANDED]
 
     def at_rest(self, apart: Callable[[], bool]) -> bool:
         """Tell all that fly to come to rest, none above another one; True once they are apart, or time is up."""
@@ -225,41 +236,31 @@ class GroundStation:
         least, most = STOPPING_S
         return now - self._stopping > most or (now - self._stopping > least and apart())
 
-    def order_landing(self) -> None:
-        """Have all land that are in the air; does not wait. They brake at once, all at the same time."""
+    def land(self, urgent: Callable[[], bool]) -> None:
+        """Land all that are in the air and wait until they stand; once it is `urgent`, all motors stop."""
         self.exchanging = False
-        if self._landing is None:
-            height = self.settings.station.room_origin_in_world[2]
-            request = Land.Request(duration=_duration(max(2.0, height / CLIMB_MPS)))
-            self._landing = self._clients["/all/land"].call_async(request)
-
-    def land(self, urgent: Sequence[int]) -> None:
-        """Land all that are in the air and wait until they stand; once `urgent` has a signal, all motors stop."""
-        self.exchanging = False
-        flying = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING)
-        if any(s.state in flying for s in self.status.values()):
+        if self._any(*FLYING):
             self.report("landing")
-            self.order_landing()
+            duration = _duration(max(2.0, self.settings.station.room_origin_in_world[2] / CLIMB_MPS))
+            answer = self._clients["/all/land"].call_async(Land.Request(duration=duration))
             end = time.monotonic() + self.settings.station.landing_timeout_s
-            while time.monotonic() < end and any(s.state in flying for s in self.status.values()):
+            while time.monotonic() < end and self._any(*FLYING) and not urgent():
                 if time.monotonic() - self.last_status_time > BRIDGE_SILENT_S:
                     self.report("the bridge is silent: what flies is left to its own watchdogs")
                     break
-                if urgent:
-                    self.report("EMERGENCY STOP")
-                    self._clients["/all/emergency"].call_async(Empty.Request())
-                    time.sleep(0.5)
-                    break
                 time.sleep(0.05)
-            self._landing.cancel()
-            self._landing = None
+            answer.cancel()
+        if urgent() and self._any(*FLYING, Status.STATE_LOST):
+            self.report("EMERGENCY STOP")
+            self._clients["/all/emergency"].call_async(Empty.Request())
+            time.sleep(0.5)
+        self._beating.clear()  # before: the silence that follows a later one would stop whatever is armed then
         end_heartbeat = self._clients["/all/end_heartbeat"]
         if end_heartbeat.service_is_ready():
             future = end_heartbeat.call_async(Trigger.Request())
             end = time.monotonic() + 2.0
             while not future.done() and time.monotonic() < end:
                 time.sleep(0.01)
-        self._beating.clear()
 
 
 def _duration(seconds: float) -> Duration:

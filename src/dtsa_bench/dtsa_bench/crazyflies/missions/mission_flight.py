@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.station import check_slotted
 from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_agent.crazyflie.node.bridge_node import is_urgent
 from dtsa_agent.crazyflie.settings import SwarmSettings
 from dtsa_agent.keys import check_key
 from dtsa_agent.priority import avoid_last_processor, set_ordinary_thread, set_realtime
@@ -68,7 +69,7 @@ class MissionWatch(ChannelObserver):
 
     def __bool__(self) -> bool:
         ended = self._mission.ended
-        return bool(ended) and (ended.stop.count > 1 or self._mission.at_rest(self._apart))
+        return bool(ended) and (is_urgent(ended.stop) or self._mission.at_rest(self._apart))
 
     def _apart(self) -> bool:
         places = np.array([self._channel.last_place(agent)[:2] for agent in range(1, self._channel.agents + 1)])
@@ -153,44 +154,44 @@ class _Mission:
             finally:
                 channel.close()
                 self.progress.end()
-            ground.exchanging = False
-            with _second_interrupt() as urgent:  # first they land: what follows takes seconds
-                if ended.stop.count > 1:
-                    urgent.append(signal.SIGINT)
-                if ended:
-                    ground.order_landing()  # before the agents end: no vehicle flies on without them
-                self.agents.stop()
-                ground.land(urgent)
+            ground.land(self._find_urgent())  # first: what follows takes seconds
+            self.agents.stop()
             set_ordinary_thread()  # the bridge does not: it has to watch them
             summary = flight.write_results(
-                options.pictures and not ended, backend="cflib", cut_short=ended.reason, not_landed=ground.flying,
+                options.pictures and not ended, backend="cflib", cut_short=ended.reason, not_landed=ground.not_landed,
                 vehicles=ground.log.diagnostics,
             )  # fmt: skip
             return Flight(summary, flight.scenario, measurement.positions.array(), self.directory / BAG)
         finally:
             node.destroy_node()
 
+    def _find_urgent(self) -> Callable[[], bool]:
+        """Return what says whether all motors are to stop: after a second Ctrl-C, or, while they land, the first."""
+        stop, before = self.ended.stop, self.ended.stop.interrupts
+        return lambda: is_urgent(stop) or stop.interrupts > before
+
     def end(self) -> None:
-        """All land, agents before; then the bridge ends, then the recorder closes its bag."""
-        with _second_interrupt() as urgent:
-            self.agents.stop()
+        """All land; then agents and bridge end, then the recorder closes its bag."""
+        if self.ground is not None:
+            self.ground.land(self._find_urgent())
+            self.ground.close()
+        self.agents.stop()
+        try:
+            if not self.attach:
+                child = self.bridge.all[0]  # it lands all that may still fly, then closes its links
+                if self.ground is not None and self.ground.not_landed:  # a further Ctrl-C is meant for it
+                    signal.signal(signal.SIGINT, lambda number, _: child.process.send_signal(number))
+                if not end_process(child.process, BRIDGE_END_S):
+                    raise MissionError(f"{describe_end(child)}: it did not end by itself")
+        finally:
+            end_process(self.recorder.all[0].process, RECORDER_END_S)
+            bag = self.directory / MISSION_BAG
+            if not (bag / "metadata.yaml").is_file():
+                self.progress.print_line(
+                    f"the recorder did not close {bag}: `{program()} recover {bag}` saves what it holds"
+                )
             if self.ground is not None:
-                self.ground.land(urgent)
-                self.ground.close()
-            try:
-                if not self.attach:
-                    child = self.bridge.all[0]  # it lands all that may still fly, then closes its links
-                    if not end_process(child.process, BRIDGE_END_S):
-                        raise MissionError(f"{describe_end(child)}: it did not end by itself")
-            finally:
-                end_process(self.recorder.all[0].process, RECORDER_END_S)
-                bag = self.directory / MISSION_BAG
-                if not (bag / "metadata.yaml").is_file():
-                    self.progress.print_line(
-                        f"the recorder did not close {bag}: `{program()} recover {bag}` saves what it holds"
-                    )
-                if self.ground is not None:
-                    self.ground.log.write(self.directory, self.ended.reason)
+                self.ground.log.write(self.directory, self.ended.reason)
         self.progress.end()
         self.context.try_shutdown()
 
@@ -198,13 +199,12 @@ class _Mission:
 def fly_crazyflies(
     run: RunConfig, settings: SwarmSettings, swarm_yaml: Path, out: str | Path, options: FlightOptions, stop: Stop, *,
     attach: bool = False, page: PageOptions | None = None,
-) -> tuple[Flight, str]:  # fmt: skip
+) -> Flight:  # fmt: skip
     """One mission. When this returns or raises, all have landed (or were stopped) and no process is left.
 
     :param settings: the swarm's YAML, read; `swarm_yaml` is its path.
     :param attach: by the bridge that runs already on this ROS domain, and goes on running.
     :param page: shows the mission in a browser; None: nothing does.
-    :returns: the results, and why the exchange was cut short (empty: it was not).
     :raises ConfigError: before anything has been started.
     :raises DtsaError: something failed before the exchange began, or a node died.
     """
@@ -227,26 +227,12 @@ def fly_crazyflies(
         mission = _Mission(run, settings, directory, environment, stop, attach)
         mission.start(swarm_yaml)
         try:
-            return mission.exchange(mission.take_off(scenario, domain), options), mission.ended.reason
+            return mission.exchange(mission.take_off(scenario, domain), options)
         except DtsaError as error:
             mission.ended.reason = mission.ended.reason or str(error)
             raise
         finally:
             mission.end()
-
-
-@contextmanager
-def _second_interrupt() -> Iterator[list[int]]:
-    """Once they land, one more Ctrl-C is the emergency stop: the list has its number then.
-
-    No `threading.Event`: a handler that interrupts another one would wait for ever for the lock that this one holds.
-    """
-    urgent: list[int] = []
-    old = signal.signal(signal.SIGINT, lambda number, _: urgent.append(number))
-    try:
-        yield urgent
-    finally:
-        signal.signal(signal.SIGINT, old)
 
 
 def below(priority: int, steps: int) -> int:

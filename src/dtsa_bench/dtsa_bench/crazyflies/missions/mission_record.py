@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import signal
 import sys
 import time
 from dataclasses import asdict, dataclass, field
@@ -30,6 +29,7 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.crazyflie.node.interfaces import EVENTS, EVENTS_QOS, STATE, VelocityWorld
 from dtsa_agent.priority import set_nice
 from dtsa_agent.ros.common.node_process import follow_supervisor, init_ros
+from dtsa_agent.stop import Stop
 from dtsa_bench.log.bag.writer import BagWriter
 
 MISSION_BAG = "mission_bag"  # the whole mission's bag, beside that of the exchange
@@ -123,8 +123,8 @@ def _number(text: str) -> float | str:
 
 
 # -- the bag ----------------------------------------------------------------------------------------------------------
-def record(node: Node, bag: BagWriter, names: list[str], over: list[int]) -> None:
-    """Record all of these vehicles until a signal has come (its number is in `over`), and then what is left."""
+def record(node: Node, bag: BagWriter, names: list[str], stop: Stop) -> None:
+    """Record all of these vehicles until a signal has come, and then what is left."""
     recorded: list[tuple[Any, str, QoSProfile]] = [(Log, EVENTS, EVENTS_QOS), (DiagnosticArray, "/diagnostics", ALL)]
     for name in names:
         recorded += [
@@ -141,7 +141,7 @@ def record(node: Node, bag: BagWriter, names: list[str], over: list[int]) -> Non
     last = False
     while not last:
         time.sleep(PERIOD_S)
-        last = bool(over)
+        last = bool(stop)
         for handle, kind, channel, most in topics:
             with handle:
                 for _ in range(most):
@@ -158,22 +158,20 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--bag", type=Path, required=True, help="directory that is made")
     parser.add_argument("--names", nargs="+", required=True, help="of the vehicles")
     args = parser.parse_args(argv)
-    over: list[int] = []  # no `threading.Event`: two signals at once would make its `set` wait for itself
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: over.append(number))
-    follow_supervisor()
-    set_nice(NICE)
-    init_ros(QUIET)
-    node = rclpy.create_node("mission_recorder", enable_rosout=False, start_parameter_services=False)
-    try:
-        with BagWriter(args.bag, None, custom_data={"mission": "the station's clock"}) as bag:
-            record(node, bag, args.names, over)
-    except DtsaError as error:
-        print(f"mission_recorder: {error}", file=sys.stderr)
-        return 1
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+    with Stop() as stop:
+        follow_supervisor()
+        set_nice(NICE)
+        init_ros(QUIET)
+        node = rclpy.create_node("mission_recorder", enable_rosout=False, start_parameter_services=False)
+        try:
+            with BagWriter(args.bag, None, custom_data={"mission": "the station's clock"}) as bag:
+                record(node, bag, args.names, stop)
+        except DtsaError as error:
+            print(f"mission_recorder: {error}", file=sys.stderr)
+            return 1
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
     return 0
 
 

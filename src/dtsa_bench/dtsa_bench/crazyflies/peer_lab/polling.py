@@ -7,7 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress, RadioSettings
+from dtsa_agent.crazyflie.addresses import parse_address
+from dtsa_bench.crazyflies.simulated.fleet_config import RadioSettings
 from dtsa_bench.crazyflies.simulated.radio.air import RATE_NAMES, RadioAir
 from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, DongleModel
 from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, RadioReceiver
@@ -26,11 +27,11 @@ class Polling:
         self.answered = 0
         self._agenda = air.agenda
         for agent in range(1, count + 1):
-            address = bytes((0xE7, 0xE7, 0xE7, 0xE7, agent))
-            receiver = RadioReceiver(RadioAddress("", settings.channel, settings.rate, address), lambda packet, t: None)
+            station = parse_address(f"radio://0/{settings.channel}/{settings.rate}/E7E7E7E7{agent:02X}")
+            receiver = RadioReceiver(station, lambda packet, t: None)
             receiver.on_packet = partial(heard, agent)
             air.receivers[agent] = receiver
-        self._stations = [receiver.station for receiver in air.receivers.values()]
+        self._receivers = list(air.receivers.values())
         self._dongle = DongleModel(count + 1, RadioSettings(seed=settings.seed, request_ms=0.0), air)
         self._dongle.request(SET_CHANNEL, settings.channel, b"", 0)
         self._dongle.request(SET_RATE, RATE_NAMES.index(settings.rate), b"", 0)
@@ -49,10 +50,10 @@ class Polling:
         self._agenda.at(self._due_ns, self._poll)
         if self._busy:
             return
-        station = self._stations[self._next]
-        self._next = (self._next + 1) % len(self._stations)
+        receiver = self._receivers[self._next]
+        self._next = (self._next + 1) % len(self._receivers)
         self._busy = True
-        self._dongle.request(SET_ADDRESS, 0, station.address, now)
+        self._dongle.request(SET_ADDRESS, 0, receiver.address, now)
         self._dongle.transfer(_POLL, now, self._answer)
 
     def _answer(self, data: bytes) -> None:

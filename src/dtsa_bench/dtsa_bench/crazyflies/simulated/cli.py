@@ -17,7 +17,7 @@ from dtsa_agent.priority import set_realtime
 from dtsa_bench.runs.options import add_options, option_values, whole_number
 
 from .fleet import Fleet
-from .fleet_config import FleetConfig, RadioAddress, RadioSettings
+from .fleet_config import FleetConfig, RadioSettings
 from .process import DIRECTIONS, FAULTS, NUMBERS, send_fault
 
 DESCRIPTION = """\
@@ -88,14 +88,14 @@ def _robots_of(path: Path, radio: RadioSettings, count: int | None) -> dict[str,
 
     robots = load_swarm(path).robots
     found = {"count": len(robots), "start": np.array([robot.initial_position for robot in robots]).T}
-    if radio.path is not None:
-        stations = tuple(RadioAddress.of(robot.uri) for robot in robots)
-        return {**found, "radio": dataclasses.replace(radio, stations=stations)}
-    ports = []
+    scheme, form = ("udp", "udp://HOST:PORT") if radio.path is None else ("radio", "radio://RADIO/CHANNEL/RATE/ADDRESS")
     for robot in robots:
-        if not robot.uri.startswith("udp://"):
-            raise ConfigError(f"robots.{robot.name}.uri", robot.uri, "udp://HOST:PORT for a simulated Crazyflie")
-        ports.append(int(robot.uri.rpartition(":")[2]))
+        if robot.address.scheme != scheme:
+            raise ConfigError(f"robots.{robot.name}.uri", robot.uri, f"{form} for a simulated Crazyflie")
+    if radio.path is not None:
+        stations = tuple(robot.address for robot in robots)
+        return {**found, "radio": dataclasses.replace(radio, stations=stations)}
+    ports = [robot.address.port for robot in robots]
     if ports != list(range(ports[0], ports[0] + len(ports))):
         raise ConfigError("robots", ports, "ports that follow each other, in the order of the robots")
     if count not in (None, len(ports)):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 from dtsa_agent.core.settings.flight_models import AVOIDERS, flight_model
+from dtsa_agent.crazyflie.addresses import Address
 
 from .peer import PROTOCOLS
 
@@ -25,24 +26,6 @@ def ellipse_positions(count: int, half_x_m: float = 1.2, half_y_m: float = 2.0) 
     """Start positions on the floor, (3, count), m, world: counter-clockwise from the x axis, by ids."""
     angle = 2 * math.pi * np.arange(count) / max(count, 1)
     return np.array([half_x_m * np.cos(angle), half_y_m * np.sin(angle), np.zeros(count)])
-
-
-@dataclass(frozen=True, slots=True)
-class RadioAddress:
-    """Where one Crazyflie listens."""
-
-    uri: str = "radio://0/80/2M"
-    channel: int = 80
-    rate: str = "2M"
-    address: bytes = b"\xe7\xe7\xe7\xe7\xe7"
-
-    @classmethod
-    def of(cls, uri: str) -> RadioAddress:
-        """The station of a URI such as radio://0/80/2M/E7E7E7E701; ConfigError: it is not of that kind."""
-        parts = uri.partition("?")[0].removeprefix("radio://").split("/")
-        if not uri.startswith("radio://") or len(parts) != 4:
-            raise ConfigError("uri", uri, "radio://RADIO/CHANNEL/RATE/ADDRESS for a simulated radio")
-        return cls(uri, int(parts[1]), parts[2], bytes.fromhex(parts[3]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +49,7 @@ class RadioSettings(Settings):
         1.0, "a request on USB that sets channel, address or data rate", unit="ms", minimum=0.0, maximum=100.0
     )
     path: Path | None = None
-    stations: tuple[RadioAddress, ...] = field(default=())
+    stations: tuple[Address, ...] = field(default=())
 
     def __post_init__(self) -> None:
         check(self)

@@ -120,8 +120,8 @@ class RadioAir:
         """Crazyflies that have a packet to an address, of those that can decode it, and their ids."""
         found = []
         for radio in heard & self.receivers.keys():
-            station = self.receivers[radio].station
-            listens = (station.channel, station.rate) == tuning[:2] and address in (station.address, BROADCAST)
+            own = self.receivers[radio]
+            listens = (own.channel, own.rate) == tuning[:2] and address in (own.address, BROADCAST)
             if listens and self.passes(radio, True):
                 found.append((radio, self.receivers[radio]))
         return found

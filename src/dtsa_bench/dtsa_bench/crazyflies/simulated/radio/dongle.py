@@ -142,7 +142,7 @@ class DongleModel:
     ) -> None:
         """The acknowledgement has left the air."""
         heard = self._air.receivers_of(tuning.channel, reply)
-        self._air.sniff(heard, self._air.receivers[radio].station.address, payload, tuning, reply)
+        self._air.sniff(heard, self._air.receivers[radio].address, payload, tuning, reply)
         if self._radio in heard and self._air.passes(radio, False):
             status = transfer.retries << 4 | POWER_DETECTED | ACKNOWLEDGED
             self._finish(transfer.answer, reply.end_ns, bytes((status,)) + payload)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from dtsa_bench.crazyflies.simulated.fleet_config import RadioAddress
+from dtsa_agent.crazyflie.addresses import Address
 
 QUEUE = 200  # packets that wait for the ground station; more are lost
 CHIP_QUEUE = 7  # of these on the radio chip; one more goes there with each packet that comes
@@ -23,8 +23,8 @@ UP, DOWN = 0x08, 0x04
 class RadioReceiver:
     """Radio link of one Crazyflie; `deliver` gets each new packet, and the time (s)."""
 
-    def __init__(self, station: RadioAddress, deliver: Callable[[bytes, float], None]) -> None:
-        self.station = station
+    def __init__(self, station: Address, deliver: Callable[[bytes, float], None]) -> None:
+        self.channel, self.rate, self.address = station.channel, station.rate, bytes.fromhex(station.node)
         self._deliver = deliver
         #: Called with the time (s) of each packet: it goes over the line to the flight processor.
         self.on_packet: Callable[[float], None] = lambda t: None
