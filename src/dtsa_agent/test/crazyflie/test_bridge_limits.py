@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.orders import shortest_s
+from dtsa_agent.crazyflie.orders import PEAK, shortest_s, too_short
 
 
 def test_the_shortest_duration_keeps_the_speed_of_the_firmwares_path() -> None:
@@ -23,6 +25,16 @@ def test_the_shortest_duration_keeps_the_speed_of_the_firmwares_path() -> None:
         assert max(speed) == pytest.approx(limit, rel=1e-6)
         assert shortest_s(-distance, limit) == seconds
     assert shortest_s(0.0, 1.0) > 0.0
+    assert pytest.approx(2.1875) == PEAK
+
+
+def test_why_a_duration_is_too_short() -> None:
+    # What Crazyswarm2's examples do: one metre in two seconds, also from a little below zero.
+    assert too_short(2.0, 1.05, 1.2) == ""
+    text = too_short(0.5, -1.0, 1.2)
+    assert text == "duration 0.50 s is too short for 1.00 m: at least 1.82 s (station.max_speed_mps is 1.2)"
+    for duration in (0.0, -1.0, math.nan):
+        assert too_short(duration, 0.5, 1.2)
 
 
 @pytest.mark.slow
@@ -91,3 +103,29 @@ def test_what_is_too_short_is_refused_and_motors_never_stop_between_a_stream_and
         ended = [k for k, name in enumerate(names) if name == "stream ended"]
         assert len(ended) >= 2
         assert {names[k - 1] for k in ended} <= {"go_to", "land"}
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_a_setpoint_passes_seven_files_from_its_topic_to_cflib(tmp_path: Path) -> None:
+    pytest.importorskip("cflib")
+    messages = pytest.importorskip("dtsa_msgs.msg")
+    from bridge_helpers import fake_fleet, flight, settings
+
+    from dtsa_agent.crazyflie.commands import POSITION
+    from dtsa_agent.crazyflie.node.topics import BridgeInputs
+    from dtsa_agent.crazyflie.state import State
+
+    with fake_fleet(tmp_path, 1) as fleet, flight(settings(fleet)) as pilot:
+        assert pilot.bridge.connect() == []
+        cf = pilot.bridge.vehicles["cf1"]
+        cf.arm(True)
+        wait_for(lambda: cf.state is State.ARMED)
+        message, crossed = messages.Position(z=-0.5), set[str]()
+        message.header.frame_id = "map"
+        sys.setprofile(lambda frame, event, argument: crossed.add(frame.f_code.co_filename))
+        BridgeInputs._stream(SimpleNamespace(), POSITION, cf, message, time.time())  # type: ignore[arg-type]
+        sys.setprofile(None)
+        wait_for(lambda: fleet.events(name="streaming"))
+    ours = {Path(file).stem for file in crossed if "/dtsa_agent/dtsa_agent/" in file}
+    assert ours == {"topics", "commands", "state", "vehicle", "safety", "link", "drivers"}

@@ -21,6 +21,7 @@ from dtsa_agent.crazyflie.safety import (
     SafetyMonitor,
     SafetySettings,
     WatchedVehicle,
+    outside_fence,
 )
 from dtsa_agent.crazyflie.settings import GroundStationSettings, RobotSettings
 from dtsa_agent.crazyflie.state import State, StateMachine
@@ -165,6 +166,15 @@ def test_nothing_is_done_without_need() -> None:
     assert verdicts(vehicle(), vehicle("cf2", position=(0.3, 0.0, 0.0)), heartbeat=0.9) == []
 
 
+@pytest.mark.parametrize(
+    ("where", "axis"), [((1.56, 0, 0), "x"), ((-1.56, 0, 0), "x"), ((0, 2.36, 0), "y"), ((0, 0, 1.01), "z")]
+)
+def test_geofence_lands(where: tuple[float, float, float], axis: str) -> None:
+    (verdict,) = SafetyMonitor(SafetySettings()).check(0.0, [vehicle(position=where)], None)
+    assert (verdict.name, verdict.action, verdict.rule) == ("cf1", Action.LAND, "geofence")
+    assert f"in {axis}" in verdict.reason
+
+
 def test_battery_warns_then_lands_but_not_for_a_moment() -> None:
     monitor = SafetyMonitor(SafetySettings())
 
@@ -191,7 +201,6 @@ FAR = (2.4, 0, 0)
         ({"position": FAR}, {}, [FENCE, ("cf1", Action.STOP, "geofence")]),  # the motors stop
         ({"position": FAR, "state": State.LANDING}, {}, [("cf1", Action.STOP, "geofence")]),
         ({"position": FAR}, {"geofence": False}, []),
-        ({"position": (-1.56, 0, 0)}, {}, [FENCE]),
         ({"position": (1.56, 0, 0), "state": State.READY}, {}, []),
         ({"log_age": 0.51}, {}, [LOST]),
         ({"log_age": math.inf, "state": State.CONNECTING}, {}, []),
@@ -261,6 +270,14 @@ def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused(
     one.machine.enter(State.FLYING, "")
     problem = one.command(setpoint)
     assert (words in problem, bool(problem), one.refused) == (True, bool(words), bool(words))
+
+
+def test_how_far_a_place_is_outside_the_fence() -> None:
+    fence, origin = SafetySettings(), (0.0, 0.0, 0.95)
+    assert outside_fence((1.5, 0.0, 1.0), fence, origin) == ""
+    assert outside_fence((1.95, 0.0, 0.95), fence, origin) == "(1.95, 0.00, 0.00) is 0.45 m outside the geofence in x"
+    assert outside_fence((0.0, 0.0, 2.5), fence, origin).endswith("0.60 m outside the geofence in z")
+    assert outside_fence((9.0, 0.0, 1.0), SafetySettings(geofence=False), origin) == ""
 
 
 def test_a_take_off_is_ordered_again_while_the_supervisor_lets_no_motor_run() -> None:

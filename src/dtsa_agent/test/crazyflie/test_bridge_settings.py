@@ -234,6 +234,8 @@ def test_two_dongles_on_one_channel_carry_no_more_than_one() -> None:
 def test_the_budget_says_with_which_rates_it_would_fit() -> None:
     (load,) = radio_loads(robots(10, 50))
     assert str(load).endswith("DOES NOT FIT (command_rate_hz and log_rate_hz 15 fit)")
+    (load,) = radio_loads(robots(10, 15))
+    assert str(load).endswith(": fits")
 
 
 def test_a_crazyflie_belongs_to_one_bridge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,12 @@ component = st.floats(-1, 1)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
+def test_log_block_fits_one_packet() -> None:
+    size = struct.calcsize("<6hIHH")
+    assert size <= 26
+    assert len(states.LOG_VARIABLES) == 9
+
+
 def test_state_log_is_in_millimetres_and_millivolts() -> None:
     numbers = dict.fromkeys(states.LOG_VARIABLES, 0.0) | {"stateEstimateZ.quat": 0xC0000000}
     numbers |= {"pm.vbatMV": 3712, "supervisor.info": 0x1A}

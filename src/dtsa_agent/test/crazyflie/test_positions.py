@@ -6,6 +6,7 @@ import math
 import os
 import re
 import sys
+import time
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ import yaml
 from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.positions import POSES_AFTER_JUMP, PoseTracker, PositionSettings
+from dtsa_agent.crazyflie.positions import POSES_AFTER_JUMP, PoseTracker, PositionSettings, quantile
 from dtsa_agent.crazyflie.safety import EstimateWatch, SafetySettings
 from dtsa_agent.crazyflie.settings import parse_swarm
 from dtsa_agent.crazyflie.state import VehicleState
@@ -97,6 +98,18 @@ def test_poses_that_come_late_are_not_believed() -> None:
     assert all(at(0.49 + 0.01 * k, 7.0 + 0.01 * k) for k in range(60))
     answers = [at(1.2 + 0.01 * k, 8.0 + 0.01 * k, flying=False) for k in range(POSES_AFTER_JUMP + 5)]
     assert answers == [""] * len(answers)  # they have agreed with each other for long
+
+
+def test_latency_and_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    t = tracker()
+    cf = SimpleNamespace(loc=SimpleNamespace(send_extpose=lambda *pose: None))
+    for k in range(150):
+        offer(t, (0.0, 0.0, 0.0), 1.0 + 0.01 * k)
+        monkeypatch.setattr(time, "time", lambda k=k: 1000.0 + 1.0 + 0.01 * k + 0.004)
+        t.send(cf)
+    assert t.rate_hz(2.495) == pytest.approx(100, abs=1)
+    assert (quantile(t.latencies, 0.5), quantile(t.latencies, 0.99)) == (pytest.approx(0.004), pytest.approx(0.004))
+    assert (t.sent, t.age(2.495)) == (150, pytest.approx(0.005))
 
 
 def test_a_pose_that_stands_still_in_flight_is_no_pose() -> None:

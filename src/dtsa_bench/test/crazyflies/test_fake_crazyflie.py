@@ -19,8 +19,15 @@ from hypothesis import strategies as st
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.commands.cli import main
 from dtsa_bench.crazyflies.simulated import Fleet, FleetConfig, crtp
+from dtsa_bench.crazyflies.simulated.fleet_config import ellipse_positions
 from dtsa_bench.crazyflies.simulated.process import free_base_port
 from dtsa_bench.crazyflies.simulated.truth import read_truth
+
+
+@settings(deadline=None)
+@given(st.integers(0, 15), st.integers(0, 3), st.binary(max_size=30))
+def test_packets_round_trip(port: int, channel: int, data: bytes) -> None:
+    assert crtp.unpack(crtp.pack(port, channel, data)) == (port, channel, data)
 
 
 @settings(deadline=None)
@@ -143,6 +150,15 @@ def test_bad_fleets_are_refused(values: dict[str, Any], field: str) -> None:
     assert error.value.field == field
 
 
+def test_start_positions_keep_their_distance() -> None:
+    p = ellipse_positions(12)
+    assert p.shape == (3, 12)
+    assert np.abs(p[0]).max() <= 1.2 + 1e-12
+    assert np.abs(p[1]).max() <= 2.0 + 1e-12
+    gap = np.linalg.norm(p[:, :, None] - p[:, None, :], axis=0) + 10 * np.eye(12)
+    assert gap.min() > 0.3
+
+
 def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     port = free_base_port(1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as busy:
@@ -154,13 +170,23 @@ def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "control port of a running fleet" in capsys.readouterr().err
 
 
-def test_the_command_lets_vehicles_of_a_running_fleet_fail(tmp_path: Path) -> None:
+def test_a_running_fleet_answers_and_ends_with_ctrl_c(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
     from bridge_helpers import fake_fleet
 
-    with fake_fleet(tmp_path, 2) as fleet:
-        words = ["fake-crazyflie", "--fault", "freeze", "--cf", "2", "--seconds", "0.2"]
-        assert main([*words, "--base-port", str(fleet.base_port)]) == 0
+    with fake_fleet(tmp_path, 2) as fleet, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as host:
+        port = fleet.base_port
+        host.settimeout(5)
+        host.connect(("127.0.0.1", port))
+        host.send(b"\xff")
+        assert host.recv(64)
+        host.connect(("127.0.0.1", port - 1))
+        host.send(b"nonsense")
+        assert json.loads(host.recv(512))["ok"] is False
+        assert (
+            main(["fake-crazyflie", "--fault", "freeze", "--cf", "2", "--seconds", "0.2", "--base-port", str(port)])
+            == 0
+        )
     (fault,) = fleet.events(name="fault: freeze")
     assert (set(fault), fault["cf"]) == ({"t", "cf", "event", "seconds"}, 2)
 

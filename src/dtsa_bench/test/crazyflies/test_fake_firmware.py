@@ -10,6 +10,7 @@ from craft import Craft
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dtsa_agent.crazyflie.state import decompress_quaternion, yaw_of
 from dtsa_bench.crazyflies.simulated import crtp, planner
 from dtsa_bench.crazyflies.simulated.estimate import attitude, compress, quaternion
 from dtsa_bench.crazyflies.simulated.firmware import FLY, OFF, Battery
@@ -161,6 +162,12 @@ def test_full_state_setpoints_and_yaw() -> None:
         craft.fly(0.1)
     assert craft.estimate.position == pytest.approx((0.2, -0.1, 1.1), abs=0.01)
     assert craft.firmware.yaw == pytest.approx(1.0, abs=0.01)
+
+
+@settings(deadline=None)
+@given(st.floats(-3.1, 3.1))
+def test_heading_survives_compression(yaw: float) -> None:
+    assert yaw_of(decompress_quaternion(compress(quaternion(0.1, -0.2, yaw)))) == pytest.approx(yaw, abs=0.01)
 
 
 def test_a_quadcopter_leans_where_it_accelerates() -> None:
