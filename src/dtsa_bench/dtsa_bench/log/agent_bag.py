@@ -27,7 +27,7 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.cdr import pack_received
+from dtsa_agent.ros.common.cdr import ns_of, pack_received
 from dtsa_bench.log.arrays import DECIDED, NEW, VECTORS, ReceivedFrames
 from dtsa_bench.log.bag import metadata
 from dtsa_bench.log.bag.errors import BagError, NothingWritten, UnusableBag
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "summary"  # name in custom data
 _CHUNK = 1 << 18  # bytes
+_MANY = 1000  # slots that an agent had no part in: those of a time that it has taken over are kept apart
 _AT_A_TIME = 8  # slots: several at a time take half as long
 _MOST_NS = 1 << 58  # of a clock, nine years: sums and differences of times fit into 64 bits
 _MOST_OF_PORT = 10**12  # ns or bytes
@@ -71,7 +72,7 @@ class AgentBag:
     port: PortProperties
     started_ns: int  # own clock, when its process began
     log: FlightLog  # one column, its own, as that of agent 1; times of its own clock; frames are whole datagrams
-    earlier: list[FlightLog] = field(default_factory=list)  # slots before it took over a time with smaller numbers
+    earlier: list[FlightLog] = field(default_factory=list)  # of times that it gave up, unless for near larger numbers
     refused: Counter[str] = field(default_factory=Counter)  # datagrams not accepted, by reason
     summary: dict[str, Any] = field(default_factory=dict)  # its own; empty: it was killed
     broken_off: bool = False  # the file was not finished, or is damaged
@@ -329,7 +330,7 @@ def _read_bag(file: Path, bag: Bag, messages: Sequence[BagMessage], damage: str)
         # As they were recorded: the clock of a vehicle that was switched off starts anew. Up to the first that is lost.
         own = sorted((one for one in messages if one.topic == SLOT_RECORD), key=lambda message: message.sequence)
         records = [bag.decode(message) for number, message in enumerate(own) if message.sequence == number]
-        logs = [_log_of(part, file.stem, agent, swarm, about) for part in _split_times(records)]
+        logs = [_log_of(part, file.stem, agent, swarm, about) for part in _split_times(records, swarm.slot_ns)]
         refused = Counter({str(why): int(count) for why, count in summary.get("not_taken_in", {}).items()})
         return AgentBag(
             file, agent, swarm, _port_of(about), started_ns, logs[-1], logs[:-1], refused, summary,
@@ -349,14 +350,22 @@ def _port_of(about: Mapping[str, Any]) -> PortProperties:
     return port
 
 
-def _split_times(records: Sequence[Any]) -> list[list[Any]]:
-    """The records of each time that an agent has taken over, the last one perhaps without any."""
+def _split_times(records: Sequence[Any], slot_ns: int) -> list[list[Any]]:
+    """The records of each time that an agent has taken over, the last one perhaps without any.
+
+    A time with larger numbers goes on in the same log, with a row for each slot between, unless these are many.
+    """
     times: list[list[Any]] = [[]]
     for record in records:
-        if times[-1] and record.slot <= times[-1][-1].slot:
-            if not record.presence[0] & NEW:
-                raise ValueError(f"slot {record.slot} comes after slot {times[-1][-1].slot}")
-            times.append([])
+        if times[-1]:
+            last, is_new = times[-1][-1], record.presence[0] & NEW
+            slots = int(record.slot) - int(last.slot)
+            if slots <= 0 and not is_new:
+                raise ValueError(f"slot {record.slot} comes after slot {last.slot}")
+            # After a stand-still it restarts, too, but its slots start where they would have.
+            off_ns = ns_of(record.header.stamp) - ns_of(last.header.stamp) - slots * slot_ns
+            if slots <= 0 or (slots > _MANY and is_new and 2 * abs(off_ns) > slot_ns):
+                times.append([])
         times[-1].append(record)
     return times
 

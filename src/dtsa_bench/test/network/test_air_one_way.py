@@ -188,13 +188,20 @@ def test_clocks_are_fit_within_groups_connected_both_ways() -> None:
     assert line.flight_ns == pytest.approx(MS, abs=50_000)
 
 
-def _recorded(path: Path, slots: list[int], steps: int = CONFIG.steps, about: dict[str, Any] | None = None) -> AgentBag:
-    """The bag of an agent that took over another time wherever its slots count back; `about`: other values of it."""
+def _recorded(
+    path: Path, slots: list[int], steps: int = CONFIG.steps, about: dict[str, Any] | None = None,
+    again: int = 1 << 62, off: int = 0,
+) -> AgentBag:  # fmt: skip
+    """The bag of an agent that took over another time wherever its slots count back; `about`: other values of it.
+
+    With slot `again` it restarts, too, in a time whose slots start so many slots earlier than they would have.
+    """
     zero, track = np.zeros(3), np.zeros((steps, 3))
     with AgentRecorder(path, AgentSettings(id=1), CONFIG, UdpSettings(interface="lo")) as recorder:
         for at, slot in enumerate(slots):
-            is_first = at == 0 or slot < slots[at - 1]
-            recorder.slot(SlotRecord(slot, slot * CONFIG.slot_ns, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
+            is_first = at == 0 or slot < slots[at - 1] or slot == again
+            start_ns = (slot - off * (slot >= again)) * CONFIG.slot_ns
+            recorder.slot(SlotRecord(slot, start_ns, is_first, 1, 0, 0, 0, 0.0, track, zero, zero, zero))
         custom = recorder._bag.custom_data
         custom[AGENT] = json.dumps(json.loads(custom[AGENT]) | (about or {}))
     return read(path)
@@ -208,6 +215,17 @@ def test_slots_of_times_that_were_given_up_are_kept_apart(tmp_path: Path) -> Non
     assert {key: values.tolist() for key, values in slots.items()} == {
         (1, 0): [3, 4], (1, 1): [5, 6], (1, -1): [70, 71], (1, -2): [80], (1, -3): [90, 91],
     }  # fmt: skip
+
+
+def test_a_time_that_was_given_up_is_kept_apart_whatever_its_numbers(tmp_path: Path) -> None:
+    """An agent that was alone, and came to hear a swarm that had flown for months; or that only stood still."""
+    last = 1 << 30
+    bag = _recorded(tmp_path / "cf1.mcap", [3, 4, 5, last, last + 1], again=last, off=last - 6)
+    assert bag.slots.tolist() == [last, last + 1]
+    assert [(len(log), log.first_slot) for log in bag.earlier] == [(3, 3)]
+    assert Merge([bag]).summary()["slots_of_times_given_up"] == 3
+    bag = _recorded(tmp_path / "cf2.mcap", [3, 4, 5, 9000], again=9000)
+    assert (bag.slots.tolist(), bag.earlier) == ([3, 4, 5, 9000], [])
 
 
 def test_frames_of_times_that_were_given_up_are_sent_and_share_no_slot_with_others(bags: list[Path]) -> None:

@@ -184,7 +184,7 @@ def _processes(bags: Sequence[AgentBag]) -> dict[Process, AgentBag]:
         if before is not None and bag.log.first_slot < before.log.first_slot + len(before.log):
             raise ConfigError("bag", str(bag.path), f"one process of cf{bag.agent} at a time: {before.path} is another")
         found[(bag.agent, number)] = bag
-    for bag in bags:  # what it flew before it took over a time with smaller numbers: processes of negative ones
+    for bag in bags:  # what it flew before it took over another time: processes of negative numbers
         for log in reversed(bag.earlier):
             number = -1 - sum(agent == bag.agent and number < 0 for agent, number in found)
             found[(bag.agent, number)] = dataclasses.replace(bag, log=log, summary={}, refused=Counter())
