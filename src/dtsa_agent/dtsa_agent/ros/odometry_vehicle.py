@@ -43,6 +43,7 @@ LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LONGEST_PREDICTION_S = 0.15
 _SILENT_S = 0.3  # after such a silence another publisher may take over
 _SLACK_M = 0.5  # odometry may be off by this from one message to the next
+_BACKLOG_S = 0.1  # after a stand-still the middleware hands over what has waited within this time
 HOLD_GAIN, HOLD_MPS = 1.0, 0.3  # 1/s, m/s: of an agent that hovers: real air does not leave it where it is
 _STOPS, _STOPS_S = 5, 0.1  # how often an agent that ends tells its vehicle to stop, within which time
 
@@ -82,12 +83,16 @@ class VehicleOdometry:
     :param intake: counts what is not used.
     :param frame: of the messages whose origin is that of the settings, others are in the map; empty: all.
     :param is_stamped: stamps are of this machine's clock: they say how old the odometry is, not when it came.
+    :param standstill_s: where nobody has asked for odometry for longer, what has waited is not used: it would pass for
+        new.
     """
 
     def __init__(
-        self, node: Node, settings: VehicleSettings, intake: Intake, frame: str = "", is_stamped: bool = False
-    ) -> None:
+        self, node: Node, settings: VehicleSettings, intake: Intake, frame: str = "", is_stamped: bool = False,
+        standstill_s: float = math.inf,
+    ) -> None:  # fmt: skip
         self._settings, self._frame, self._is_stamped = settings, frame, is_stamped
+        self._standstill_s, self._asked_s, self._used_from_s = standstill_s, 0.0, 0.0  # s, the latter two monotonic
         self._sender: bytes | None = None  # of the last accepted one
         self._came_s = -math.inf  # s, monotonic: when that came
         self._measured_s = 0.0  # when its vehicle was there
@@ -105,9 +110,17 @@ class VehicleOdometry:
         """Whether the last accepted one came just now."""
         return time.monotonic() - self._came_s < self._settings.stale_s
 
+    def take(self) -> None:
+        """Accept what has come, if anything has."""
+        now = time.monotonic()
+        if now - self._asked_s > self._standstill_s:
+            self._used_from_s = now + _BACKLOG_S
+        self._asked_s = now
+        self.feed.take()
+
     def sense(self, swarm: Swarm) -> None:
         """Write the newest odometry, moved on by its age, into an agent; without any for a while the agent stands."""
-        self.feed.take()
+        self.take()
         if not self.is_fresh:
             swarm.velocity[:, 0] = 0.0
             return
@@ -120,6 +133,8 @@ class VehicleOdometry:
     def _accept(self, message: Odometry, sender: bytes | None) -> None:
         check_odometry(message)
         now, fastest = time.monotonic(), self._settings.fastest_mps
+        if now < self._used_from_s:
+            return
         if sender != self._sender and now - self._came_s < _SILENT_S:
             raise BadMessage(OTHER_SENDER, f"{self._settings.odometry_topic} from two publishers")
         place, speed, q = message.pose.pose.position, message.twist.twist.linear, message.pose.pose.orientation
@@ -149,7 +164,8 @@ class OdometryVehicle(AgentVehicle):
         self._kind = TwistStamped if settings.command_type == TWIST else VelocityWorld
         self._publisher = node.create_publisher(self._kind, settings.command_topic, 1)
         self._intake = Intake(node.get_logger())
-        self._odometry = VehicleOdometry(node, settings, self._intake)
+        standstill_s = max(settings.stale_s, 2 * slot_s)  # it is asked for once a slot
+        self._odometry = VehicleOdometry(node, settings, self._intake, standstill_s=standstill_s)
 
     def close(self) -> None:
         """Stop the vehicle: the agent has ended.
@@ -167,7 +183,7 @@ class OdometryVehicle(AgentVehicle):
 
     def is_ready(self) -> bool:
         """Whether odometry has come, and is fresh."""
-        self._odometry.feed.take()
+        self._odometry.take()
         self._odometry.feed.housekeeping()
         return self._odometry.is_fresh
 

@@ -85,17 +85,17 @@ def test_odometry_of_one_publisher_is_used_until_it_is_silent(tmp_path: Path) ->
     with ros_domain() as domain, ExitStack() as stack:
         nodes = [stack.enter_context(graph_in(domain, tmp_path)).node for _ in range(3)]
         intake = Intake()
-        odometry = VehicleOdometry(nodes[0], VehicleSettings(odometry_topic="/odom"), intake)
+        odometry = VehicleOdometry(nodes[0], VehicleSettings(odometry_topic="/odom"), intake, standstill_s=0.3)
         stack.callback(odometry.feed.close)
         swarm = make_swarm(SwarmConfig(agents=2), None, local=[1])
         first, second = (node.create_publisher(Odometry, "/odom", 1) for node in nodes[1:])
         wait_for(lambda: first.get_subscription_count() and second.get_subscription_count())
 
-        def x_after(publisher: Publisher, x: float) -> float:
+        def x_after(publisher: Publisher, x: float, seconds: float = 0.02) -> float:
             message = Odometry()
             message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
             publisher.publish(message)
-            time.sleep(0.02)
+            time.sleep(seconds)
             odometry.sense(swarm)
             return float(swarm.position[0, 0])
 
@@ -103,6 +103,10 @@ def test_odometry_of_one_publisher_is_used_until_it_is_silent(tmp_path: Path) ->
         # Each in its turn, for the feed keeps the last message.
         wait_for(lambda: x_after(first, 1.0) == x_after(second, 1.2) == 1.0 and intake.counts[OTHER_SENDER])
         wait_for(lambda: x_after(second, 1.2) == 1.2)
+        # The agent stands still: what has waited is old, and the vehicle elsewhere.
+        assert x_after(second, 1.4, seconds=1.0) == 1.2
+        assert not odometry.is_fresh
+        wait_for(lambda: x_after(second, 1.6) == 1.6)
 
 
 @pytest.mark.ros
