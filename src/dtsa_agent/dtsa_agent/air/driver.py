@@ -48,6 +48,9 @@ class AgentVehicle:
         """Return what a station calls before each slot of the agent; None: there is nothing to sense."""
         return None if type(self).sense is AgentVehicle.sense else lambda slot: self.sense(swarm)
 
+    def hover(self, swarm: Swarm) -> None:
+        """Hold the vehicle where it is: the agent has no slots yet. Called again and again until it has."""
+
     def fly(self, swarm: Swarm, slot: int) -> None:
         """Fly through a slot, after the agent has decided."""
         swarm.fly(slot)
@@ -138,10 +141,11 @@ class LiveAgent:
                     self._send(datagram, shown)
                 elif station.slot != self.slot:
                     self._fly(station.slot, now)
-            if count == _BURST:
-                continue
             if self.slot < 0:
                 self.reports.state("listens for others", now)
+                self._vehicle.hover(self.swarm)
+            if count == _BURST:
+                continue
             left = min((clock.monotonic_ns(due) - time.monotonic_ns()) / 1e9, _SIGNAL_POLL_S)
             if left <= 0:
                 continue

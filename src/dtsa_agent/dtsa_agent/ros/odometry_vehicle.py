@@ -159,6 +159,7 @@ class OdometryVehicle(AgentVehicle):
     def __init__(self, node: Node, settings: VehicleSettings, slot_s: float) -> None:
         self._settings, self._node = settings, node
         self._every = max(1, round(1.0 / settings.command_hz / slot_s))
+        self._next_s = -math.inf  # s, monotonic: of the next command before the first slot
         self._frame = names.FRAME if settings.command_frame == MAP else names.body_frame(node.get_namespace())
         self._hold: Any = None  # m, map: where it was when it began to hover
         self._kind = TwistStamped if settings.command_type == TWIST else VelocityWorld
@@ -199,20 +200,31 @@ class OdometryVehicle(AgentVehicle):
         self._odometry.sense(swarm)
         self._odometry.feed.housekeeping()
 
+    def hover(self, swarm: Swarm) -> None:
+        self.sense(swarm)
+        now = time.monotonic()
+        if now >= self._next_s:
+            self._next_s = now + 1.0 / self._settings.command_hz
+            self._command(self._hold_velocity(swarm))
+
     def fly(self, swarm: Swarm, slot: int) -> None:
         """Publish the velocity for a slot: the agent's command, or one that holds the vehicle."""
         if slot % self._every:
             return
         swarm.steer(slot, 0)
-        if not self._odometry.is_fresh:
-            swarm.command[:, 0] = 0.0
-        elif swarm.active[0]:
+        if swarm.active[0] and self._odometry.is_fresh:
             self._hold = None
         else:
-            if self._hold is None:
-                self._hold = swarm.position[:, 0].copy()
-            swarm.command[:, 0] = velocity_to(self._hold - swarm.position[:, 0])
+            swarm.command[:, 0] = self._hold_velocity(swarm)
         self._command(swarm.command[:, 0])
+
+    def _hold_velocity(self, swarm: Swarm) -> Any:
+        """Return the velocity, (3,) m/s, map, that holds the vehicle where that began; 0 without odometry."""
+        if not self._odometry.is_fresh:
+            return np.zeros(3)
+        if self._hold is None:
+            self._hold = swarm.position[:, 0].copy()
+        return velocity_to(self._hold - swarm.position[:, 0])
 
     def _command(self, velocity: Any) -> None:
         """Publish a velocity, (3,) m/s, map."""

@@ -109,18 +109,36 @@ def test_odometry_of_one_publisher_is_used_until_it_is_silent(tmp_path: Path) ->
         wait_for(lambda: x_after(second, 1.6) == 1.6)
 
 
-@pytest.mark.ros
-def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_path: Path) -> None:
+def words(agents: int, slot_ms: float) -> list[str]:
+    """Parameters of agent 1, which flies the vehicle above."""
     group = f"239.255.{random.randrange(256)}.{random.randrange(256)}:{random.randrange(20_000, 30_000)}"
+    values = {
+        "id": 1, "agents": agents, "air": "udp", "interface": "lo", "group": group, "auth": False, "axis_x_m": 50.0,
+        "vehicle": "odometry", "odometry_topic": "/uav1/local_position/odom", "odometry_origin": "[1.0, 2.0, 0.5]",
+        "command_topic": "/uav1/setpoint_velocity/cmd_vel", "slot_ms": slot_ms, "quorum": "0%",
+    }  # fmt: skip
+    return [word for name, value in values.items() for word in ("-p", f"{name}:={str(value).lower()}")]
+
+
+@pytest.mark.ros
+def test_an_agent_that_listens_holds_its_vehicle(tmp_path: Path) -> None:
+    """For minutes, with slots of a second."""
     with ros_graph(tmp_path) as graph:
         vehicle = Vehicle(graph, (3.0, -1.0, 0.0))
-        values = {
-            "id": 1, "agents": 2, "air": "udp", "interface": "lo", "group": group, "auth": False, "axis_x_m": 50.0,
-            "vehicle": "odometry", "odometry_topic": "/uav1/local_position/odom", "odometry_origin": "[1.0, 2.0, 0.5]",
-            "command_topic": "/uav1/setpoint_velocity/cmd_vel", "slot_ms": 20.0, "quorum": "0%",
-        }  # fmt: skip
-        words = [word for name, value in values.items() for word in ("-p", f"{name}:={str(value).lower()}")]
-        process = graph.start(AGENT, *words)
+        process = graph.start(AGENT, *words(agents=100, slot_ms=1000.0))
+        graph.until(lambda: len(vehicle.commands) > 10, vehicle.act)
+        assert not np.any(vehicle.commands)
+        vehicle.position[0] += 0.25  # the wind
+        graph.until(lambda: vehicle.commands[-1][0] < -0.1, vehicle.act)
+        graph.until(lambda: abs(vehicle.position[0] - 3.0) < 0.05, vehicle.act)
+        assert end_of(process, signal.SIGTERM) == (0, "")
+
+
+@pytest.mark.ros
+def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        vehicle = Vehicle(graph, (3.0, -1.0, 0.0))
+        process = graph.start(AGENT, *words(agents=2, slot_ms=20.0))
         vehicle.until_commands(still=False)
         first = vehicle.position.copy()
         graph.until(lambda: float(np.linalg.norm(vehicle.position - first)) > 0.3, vehicle.act)
