@@ -40,11 +40,10 @@ static int nearest_index(int from, int n, const double *x, const double *y, cons
     return best;
 }
 
-/* Paths flown and the smallest distance; -> whether two agents are closer than `collision_m`. */
-static int distances(metrics *m, int64_t slot)
+/* Paths flown and the smallest distance; the first two closer than `collision_m` have crashed. */
+static void distances(metrics *m, int64_t slot)
 {
     const int n = m->n;
-    int crashed = 0;
     for (int step = 0; step < m->steps; step++) {
         const double *x = m->track + (long)step * 3 * n, *y = x + n, *z = y + n;
         for (int k = 0; k < n - 1; k++) {
@@ -56,7 +55,11 @@ static int distances(metrics *m, int64_t slot)
                 m->pair_2 = nearest_index(k + 1, n, x, y, z, k) + 1;
                 m->min_slot = slot;
             }
-            if (d2 < m->collision_m * m->collision_m) crashed = 1;
+        }
+        if (m->crash_slot < 0 && m->min_distance2 < m->collision_m * m->collision_m) {
+            m->crash_slot = slot;
+            m->crash_1 = m->pair_1;
+            m->crash_2 = m->pair_2;
         }
         for (int k = 0; k < n; k++) {
             const double dx = x[k] - m->last_position[k], dy = y[k] - m->last_position[n + k],
@@ -67,7 +70,6 @@ static int distances(metrics *m, int64_t slot)
             m->last_position[2 * n + k] = z[k];
         }
     }
-    return crashed;
 }
 
 /* Whether all moving agents are within `r_min` of their targets. */
@@ -143,8 +145,7 @@ static void table_wakings(metrics *m, const dtsa_table *t, int64_t last)
         oldest = known < oldest ? known : oldest;
         if (sent < woken || m->heard[k]) continue;
         m->heard[k] = 1;
-        const int64_t delay = last - woken;
-        m->delays[delay < METRICS_DELAYS ? delay : METRICS_DELAYS - 1]++;
+        m->delays[m->wakings_heard++] = last - woken;
     }
     m->waking_count += weight * count;
     m->waking_sum += weight * (count * last - sum);
@@ -223,16 +224,12 @@ int metrics_update(metrics *m, int64_t slot, int outcome)
         if (m->woken[k] >= 0 && m->woken[k] < slot) m->woken[k] = slot;
     m->slots = done;
     m->outcomes[outcome]++;
-    const int crashed = distances(m, done), at_targets = arrived(m, now);
+    distances(m, done);
+    const int at_targets = arrived(m, now);
     if (m->tables && done >= m->news_from) news(m, m->tables, done, now);
     if (m->tables) wakings(m, m->tables, slot, now);
     follow(m, done);
-    if (crashed && m->crash_slot < 0) {
-        m->crash_slot = done;
-        m->crash_1 = m->pair_1;
-        m->crash_2 = m->pair_2;
-        if (m->stop_on_crash) return m->end = METRICS_CRASHED;
-    }
+    if (m->crash_slot == done && m->stop_on_crash) return m->end = METRICS_CRASHED;
     if (at_targets && !m->waits && m->completion_slot < 0 && all_final(m)) {
         m->completion_slot = done;
         m->limit = done + m->tail;

@@ -4,7 +4,6 @@
 
 #include "swarm.h"
 
-enum { METRICS_DELAYS = 256 };
 enum { METRICS_FLIES, METRICS_COMPLETED, METRICS_CRASHED, METRICS_TIMED_OUT }; /* ends */
 
 typedef struct metrics {
@@ -24,9 +23,8 @@ typedef struct metrics {
     double *goal;          /* (3, n) m, where each flies to now; NaN: it does not stop there */
     int64_t *woken;        /* (n) slot in which each that flies got a goal; -1: it stands */
     uint8_t *heard;        /* (n) some agent has heard it since */
-    int64_t *delays; /* (METRICS_DELAYS) wakings by slots until the first frame was heard; the last:
-                        or more */
-    const double *track; /* (steps, 3, n) m, true positions in the slot that is over */
+    int64_t *delays;       /* (n goals) slots from each waking that was heard to the first frame */
+    const double *track;   /* (steps, 3, n) m, true positions in the slot that is over */
     int steps;
     int waits;     /* movers that came back are not at their targets: the flight is not complete */
     swarm *tables; /* NULL: ages do not count */
@@ -39,7 +37,7 @@ typedef struct metrics {
     double min_distance2, error_sum, error_max;
     int64_t pair_1, pair_2, min_slot, age_count, age_sum, age_max;
     int64_t waking_count, waking_sum, waking_max; /* ages from waking on */
-    int64_t wakings;
+    int64_t wakings, wakings_heard;
 } metrics;
 
 /* Before the first slot: those that fly at once get their goals. */

@@ -34,7 +34,6 @@ _LOSSES = (  # settings of the channel
     "loss", "burst_length", "p_good", "jam", "partition", "range_m", "capture_db", "loss_matrix", "link_loss", "losses",
     "schedule",
 )  # fmt: skip
-_DELAYS = lib.METRICS_DELAYS
 _update, _compare = lib.metrics_update, lib.metrics_compare  # once a slot
 
 
@@ -79,7 +78,8 @@ class FlightMetrics:
         self._lost = np.zeros(agents, dtype=np.uint8)
         self.woken = np.full(agents, -1, dtype=np.int64)  # (N,) slot in which each that flies got its goal; -1: stands
         self._heard = np.zeros(agents, dtype=np.uint8)  # whether any agent has heard it since
-        self._delays = np.zeros(_DELAYS, dtype=np.int64)
+        goals = 1 if scenario.plan is None else len(scenario.plan.goals)  # each of which wakes an agent once at most
+        self._delays = np.zeros(agents * goals, dtype=np.int64)  # slots until each waking was heard, of those that were
         self._course = scenario.course(np.arange(agents, dtype=np.int32), swarm.r_min)
         target = np.array(scenario.target, dtype=np.float64)
         arrays = {
@@ -264,7 +264,7 @@ class FlightMetrics:
         """Return what became of the agents that got goals; None where none did."""
         sums, slot_ms = self.kernel, self.run.swarm.slot_ms
         waiting = sums.slots - self.woken[(self.woken >= 0) & (self._heard == 0)]  # at least so long
-        delays = np.sort(np.concatenate((np.repeat(np.arange(_DELAYS), self._delays), waiting)))
+        delays = np.sort(np.concatenate((self._delays[: sums.wakings_heard], waiting)))
         mean = sums.waking_sum / sums.waking_count if sums.waking_count else None
         return {
             "waking_age_mean_slots": mean,
@@ -272,7 +272,7 @@ class FlightMetrics:
             "waking_age_mean_ms": None if mean is None else mean * slot_ms,
             "waking_age_max_ms": None if mean is None else sums.waking_max * slot_ms,
             "wakings": sums.wakings,
-            "wakings_unheard": sums.wakings - int(self._delays.sum()),
+            "wakings_unheard": sums.wakings - sums.wakings_heard,
             "first_heard_median_slots": _quantile(delays, 0.5),
             "first_heard_95_slots": _quantile(delays, 0.95),
             "first_heard_max_slots": _quantile(delays, 1.0),

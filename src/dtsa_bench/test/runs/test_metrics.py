@@ -83,6 +83,16 @@ def test_a_crash_is_any_distance_below_the_limit_at_any_instant(bulge: float, cr
     assert summary["slots"]["collision"] == 1
 
 
+def test_of_several_crashes_in_one_slot_the_first_counts() -> None:
+    metrics, scenario = pair_on_a_line()
+    track = np.stack([scenario.start] * 3)
+    track[1, :, 2] = scenario.start[:, 0] + [0.15, 0.0, 0.0]
+    track[2, :, 1] = scenario.start[:, 0] + [0.05, 0.0, 0.0]
+    assert metrics.update(0, track, None, SUCCESS) == CRASHED
+    assert metrics.summary()["collided_pair"] == [1, 3]
+    assert metrics.summary()["min_distance_pair"] == [1, 2]
+
+
 def test_a_crash_need_not_end_the_run_and_nothing_to_measure_is_none() -> None:
     metrics, scenario = pair_on_a_line(stop_on_crash=False)
     assert not metrics.update(0, along(scenario, 0.5)[None], None, SUCCESS)
@@ -216,6 +226,12 @@ def test_a_mover_that_nobody_hears_is_in_no_age_but_in_those_from_waking_on() ->
     assert summary["wakings"] == summary["wakings_unheard"] == changes
     assert summary["waking_age_max_slots"] > 20
     assert summary["first_heard_max_slots"] is None or summary["first_heard_max_slots"] > 20
+
+
+def test_a_first_frame_counts_with_all_the_slots_that_it_took() -> None:
+    config = SwarmConfig(agents=300, policy="tdma")
+    summary = simulate(RunConfig(config, limits=RunLimits(timeout_s=3.5))).summary()
+    assert [summary[f"first_heard_{name}_slots"] for name in ("median", "95", "max")] == [149, 284, 299]
 
 
 def run(radio: str, loss: float = 0.0, **swarm: Any) -> RunConfig:
