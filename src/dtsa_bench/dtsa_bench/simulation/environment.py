@@ -218,8 +218,9 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         truncated = not terminated and (bool(over) or self.slot == self._limit)
         info: dict[str, Any] = {}
         if terminated or truncated:
-            counted = {"malformed": swarm.malformed, "foreign": swarm.foreign}
-            info, self.agents = {"summary": self.metrics.summary(None) | counted}, []
+            # Actions do not say which agent is expected to send: there is no agreement about it.
+            own = {"malformed": swarm.malformed, "foreign": swarm.foreign, "agreement_share": None}
+            info, self.agents = {"summary": self.metrics.summary(None) | own}, []
         if not over:
             self.scenario.advance(slot + 1, swarm)
         flags = dict.fromkeys(names, terminated), dict.fromkeys(names, truncated)

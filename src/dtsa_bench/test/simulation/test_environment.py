@@ -103,6 +103,7 @@ def test_a_scripted_policy_flies_what_simulate_flies(policy: str, rule: Rule, se
     _, terminated, truncated, infos = steps[-1][4:]
     wanted = expected.summary()
     assert_same(infos["agent_1"]["summary"], wanted)
+    assert infos["agent_1"]["summary"]["agreement_share"] is None
     assert set(terminated.values()) == {wanted["end"] != "timed out"}
     assert set(truncated.values()) == {wanted["end"] == "timed out"}
 
@@ -115,7 +116,7 @@ def test_a_plug_in_that_observes_is_what_flew_in_the_environment() -> None:
     steps = flown(parallel_env(**settings), impatient)
     assert flight.summary["slots"]["collision"] > 0
     summary = steps[-1][-1]["agent_2"]["summary"]
-    assert_same(summary, flight.summary, {"policy", "wall_time_s", "realtime_factor"})
+    assert_same(summary, flight.summary, {"policy", "agreement_share", "wall_time_s", "realtime_factor"})
     for agent, plug_in in enumerate(made):
         np.testing.assert_array_equal(np.stack(plug_in.seen), np.stack([step[0][agent] for step in steps]))
 
