@@ -140,10 +140,12 @@ def scheduled_changes(config: Config) -> Iterable[Change]:
     before = base = {name: getattr(config, name) for name in names}
     for edge in edges:
         now = dict(base)
+        begun: set[str] = set()  # settings whose entries begin here: these end changes in flight, too
         for entry in sorted(config.schedule, key=_slot_of):
             if entry.slot <= edge and (entry.until is None or edge < entry.until):
                 now.update(entry.values)
-        values = tuple((name, value) for name, value in now.items() if value != before[name])
+                begun |= {name for name, _ in entry.values if entry.slot == edge}
+        values = tuple((name, value) for name, value in now.items() if value != before[name] or name in begun)
         before = now
         if values:
             yield Change(edge, values)
