@@ -45,10 +45,12 @@ def read_yaml(path: str | Path, name: str) -> Any:
         raise ConfigError(name, str(path), f"a readable YAML file ({reason})") from None
     try:
         return yaml.load(text, _Loader)  # a SafeLoader, see above
-    except yaml.YAMLError as error:
+    except ConfigError:
+        raise
+    except (yaml.YAMLError, LookupError, RecursionError, TypeError, ValueError) as error:  # also of its constructors
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "syntax error"
+        problem = getattr(error, "problem", None) or next(iter(str(error).splitlines()), "syntax error")
         raise ConfigError(name, f"{path}{where}", f"valid YAML ({problem})") from None
 
 

@@ -29,7 +29,10 @@ from dtsa_channel_sim.model.topology import parse_partition
     ({"interference_factor": 0.5}, "interference_factor"), ({"range_m": -1}, "range_m"), ({"los": 0.1}, "los"),
     ({"agents": 2, "loss_matrix": [[0, 1]]}, "loss_matrix"),
     ({"agents": 2, "loss_matrix": [[0, 2], [0, 0]]}, "loss_matrix[0][1]"),
-    ({"agents": 2, "loss_matrix": "much"}, "loss_matrix"), ({"link_loss": {"from": 1}}, "link_loss"),
+    ({"agents": 2, "loss_matrix": "much"}, "loss_matrix"),
+    ({"agents": 2, "loss_matrix": [[0, "1"], [0, 0]]}, "loss_matrix"),
+    ({"agents": 2, "loss_matrix": [[0, True], [0.5, 0]]}, "loss_matrix"), ({"partition": np.eye(2)}, "partition"),
+    ({"link_loss": {"from": 1}}, "link_loss"),
     ({"link_loss": [{"from": 1, "to": 2}]}, "link_loss[0].loss"),
     ({"link_loss": [{"from": 9, "to": 2, "loss": 1}]}, "link_loss[0].from"),
     ({"link_loss": [{"from": 1, "to": [2, "3-4"], "loss": 1}]}, "link_loss[0].to[1]"),
@@ -83,6 +86,8 @@ def test_yaml(tmp_path):
 
 
 @pytest.mark.parametrize(("text", "part"), [
+    ("agents: 2001-13-45", "valid YAML"), ("agents: " + "9" * 5000, "valid YAML"), ("? [agents]\n: 3", "valid YAML"),
+    ("[" * 3000, "valid YAML"), ("agents: !!bool maybe", "valid YAML"),
     ("", "No such file"), ("- 1\n- 2\n", "a mapping of settings"), ("agents: 3\nloss: lots\n", "loss: got 'lots'"),
 ])  # fmt: skip
 def test_yaml_errors_are_one_line(tmp_path, text, part):
@@ -132,6 +137,7 @@ def test_set_takes_effect_from_the_next_slot_and_replays():
     assert not any(seen[5][0])
     assert not any(seen[7][0])
     assert not any(seen[slot][0][2] for slot in range(5, 12))
+    assert any(seen[slot][0][1] for slot in range(8, 12))
     assert [change.slot for change in changes] == [5, 6]
     replay = Channel(channel.config)
     for change in changes:

@@ -14,9 +14,9 @@ class DtsaError(Exception):
 
 
 def shown(value: object) -> str:
-    """Return a value's ``repr``, shortened, for an error's text; never raises."""
+    """Return a value's ``repr``, shortened and on one line, for an error's text; never raises."""
     try:
-        text = repr(value)
+        text = " ".join(line.strip() for line in repr(value).splitlines())
     except Exception:
         text = f"<{type(value).__name__}>"
     return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + " ..."

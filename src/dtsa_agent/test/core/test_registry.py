@@ -134,6 +134,7 @@ def test_all_but_one_of_an_odd_swarm_move_by_default() -> None:
     ("policy", 7, "tdma, dtsa"), ("selection", "first", "candidates, pairwise"), ("slot_ms", -10, "0.3 to 1000 ms"),
     ("seed", -1, "0 to 9223372036854775807"), ("epsilon", 1.5, "0 to 1"), ("r_min", 0.0, "0.001 to 100 m"),
     ("options", {"v_mx": 1.0}, "v_max"), ("agents", 10**400, "1 to 1024"), ("options", {"gain": 10**400}, "a number"),
+    ("agents", np.eye(2), "1 to 1024"),
 ])  # fmt: skip
 def test_errors_name_field_value_and_what_is_allowed(field: str, value: object, allowed: str) -> None:
     with pytest.raises(ConfigError) as caught:

@@ -56,7 +56,7 @@ def allowed(cls: type[Settings], values: dict[str, Any]) -> Any:
 
 
 MODEL_VALUES = st.dictionaries(st.sampled_from(["v_max", "tau", "spacing", "rule.limit"]), st.floats(0.5, 1.0))
-LINK = {"from": "1", "to": "2-3", "loss": 0.25, "both_ways": True}
+LINK = {"from": 1, "to": [2, 3], "loss": 0.25, "both_ways": True}
 STRUCTURES: dict[str, st.SearchStrategy[Any]] = {
     "loss_matrix": st.lists(st.lists(st.floats(0, 1), min_size=4, max_size=4), min_size=4, max_size=4),
     "link_loss": st.lists(st.just(LINK) | st.builds(lambda p: {"from": 4, "loss": p}, st.floats(0, 1))),

@@ -25,7 +25,7 @@ _LINK_KEYS = ("from", "to", "loss", "both_ways")
 
 def listed(value: object, name: str) -> Sequence[Any]:
     """Return a list, also of a JSON text; None and empty text: an empty one."""
-    if value is None or value == "":
+    if value is None or (isinstance(value, str) and not value):
         return ()
     entries = value
     if isinstance(value, str):
@@ -109,6 +109,8 @@ def parse_matrix(value: object, agents: int, name: str = "loss_matrix") -> Matri
     if value is None:
         return ()
     try:
+        if {bool, str} & set(map(type, np.array(value, dtype=object).flat)):
+            raise TypeError
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ConfigError(name, value, f"{agents} rows of {agents} numbers from 0 to 1") from None
