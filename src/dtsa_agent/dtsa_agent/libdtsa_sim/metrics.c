@@ -143,7 +143,7 @@ static void table_wakings(metrics *m, const dtsa_table *t, int64_t last)
         count++;
         sum += known;
         oldest = known < oldest ? known : oldest;
-        if (sent < woken || m->heard[k]) continue;
+        if (sent < woken || m->heard[k] || !weight) continue; /* no weight: it is alone */
         m->heard[k] = 1;
         m->delays[m->wakings_heard++] = last - woken;
     }

@@ -166,7 +166,8 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         """
         seed = self._next_seed if seed is None else seed
         swarm_config = replace(self.run.swarm, seed=seed)
-        self.run = run = replace(self.run, swarm=swarm_config, channel=replace(self.run.air, seed=seed))
+        air_seed = (seed + self.run.air.seed - self.run.swarm.seed) % 2**63  # as far apart as in the run given
+        self.run = run = replace(self.run, swarm=swarm_config, channel=replace(self.run.air, seed=air_seed))
         self._next_seed = seed + 1
         #: What no agent knows, to look at: the scenario, the swarm, the metrics of the flight under way.
         self.scenario = make_scenario(run.swarm)

@@ -232,6 +232,8 @@ def test_a_first_frame_counts_with_all_the_slots_that_it_took() -> None:
     config = SwarmConfig(agents=300, policy="tdma")
     summary = simulate(RunConfig(config, limits=RunLimits(timeout_s=3.5))).summary()
     assert [summary[f"first_heard_{name}_slots"] for name in ("median", "95", "max")] == [149, 284, 299]
+    alone = simulate(RunConfig(SwarmConfig(agents=1, moving=1), limits=RunLimits(timeout_s=0.5))).summary()
+    assert (alone["wakings_unheard"], alone["first_heard_max_slots"]) == (1, 50)
 
 
 def run(radio: str, loss: float = 0.0, **swarm: Any) -> RunConfig:

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 import dtsa
 from dtsa.env import Observer, SlotResults, SwarmEnv, fields, parallel_env
+from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_bench.simulation import environment
 from dtsa_bench.simulation.simulate import simulate
+from dtsa_channel_sim import ChannelConfig
 
 pytest.importorskip("pettingzoo")
 
@@ -106,6 +108,12 @@ def test_a_scripted_policy_flies_what_simulate_flies(policy: str, rule: Rule, se
     assert infos["agent_1"]["summary"]["agreement_share"] is None
     assert set(terminated.values()) == {wanted["end"] != "timed out"}
     assert set(truncated.values()) == {wanted["end"] == "timed out"}
+
+
+def test_a_run_has_the_seed_of_its_channel() -> None:
+    channel = ChannelConfig(agents=6, loss=0.2, seed=0)
+    run = RunConfig(dtsa.SwarmConfig(agents=6, policy="tdma", seed=5), channel, RunLimits(timeout_s=1.5))
+    assert_same(flown(parallel_env(run), tdma)[-1][-1]["agent_1"]["summary"], simulate(run).summary())
 
 
 def test_a_plug_in_that_observes_is_what_flew_in_the_environment() -> None:
