@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -122,26 +123,31 @@ def test_efficiency_is_displacement_over_path_of_movers_only() -> None:
     assert metrics.summary()["efficiency_mean"] == pytest.approx((5.0 / 7.0 + 1.0) / 2)
 
 
+def flown(swarm: Swarm, air: ChannelConfig, slots: int, *listeners: Swarm) -> Iterator[tuple[int, int]]:
+    """Fly slot by slot; yields each when it is over, and its outcome."""
+    channel = Channel(air)
+    for slot in range(slots):
+        swarm.scenario.advance(slot, swarm)
+        senders = swarm.begin(slot)
+        swarm.fly(slot)
+        verdict = channel.arbitrate(slot, [swarm.ids[index] for index in senders])
+        for tables in (swarm, *listeners):
+            for index, mask in zip(senders, verdict.mask(len(swarm.ids)), strict=True):
+                tables.hear(slot, swarm.frame(index), mask)
+            tables.end(slot)
+        yield slot, verdict.outcome
+
+
 def fly(run: RunConfig, slots: int) -> tuple[FlightMetrics, FlightMetrics, dict[str, list[float]]]:
     """Flies a lossy swarm; measures from the agents' own tables, from a listener's, and with plain NumPy."""
     config = run.swarm
     scenario = make_scenario(config)
-    swarm, channel = Swarm(config, scenario), Channel(run.air)
-    tables = metrics_tables(run, scenario, everyone=True)
+    swarm, tables = Swarm(config, scenario), metrics_tables(run, scenario, everyone=True)
     own, listener = FlightMetrics(run, scenario), FlightMetrics(run, scenario)
     plain: dict[str, list[float]] = {"age": [], "error": []}
-    for slot in range(slots):
-        senders = swarm.begin(slot)
-        swarm.fly(slot)
-        verdict = channel.arbitrate(slot, [swarm.ids[index] for index in senders])
-        mask = verdict.mask(config.agents)
-        for row, index in enumerate(senders):
-            for heard in (swarm, tables):
-                heard.hear(slot, swarm.frame(index), mask[row])
-        swarm.end(slot)
-        tables.end(slot)
-        own.update(slot, swarm.track, swarm, verdict.outcome)
-        listener.update(slot, swarm.track, tables, verdict.outcome)
+    for slot, outcome in flown(swarm, run.air, slots, tables):
+        own.update(slot, swarm.track, swarm, outcome)
+        listener.update(slot, swarm.track, tables, outcome)
         if slot + 1 < config.agents:
             continue
         for observer in range(config.agents):
@@ -175,20 +181,11 @@ def test_ages_from_waking_on_count_every_receiver_heard_or_not(policy: str, task
     config = SwarmConfig(agents=6, policy=policy, scenario=task, slot_ms=50.0, seed=2)
     air = ChannelConfig(agents=6, slot_ns=config.slot_ns, seed=3, loss=0.3)
     run, scenario = RunConfig(config, air, RunLimits(tail_s=100.0)), make_scenario(config)
-    swarm, channel = Swarm(config, scenario), Channel(air)
-    metrics = FlightMetrics(run, scenario)
+    swarm, metrics = Swarm(config, scenario), FlightMetrics(run, scenario)
     begin = scenario.plan.begin if scenario.plan else np.zeros(6, dtype=np.int64)
     arrived, first, ages = np.zeros(6, dtype=bool), np.full(6, -1), []
-    for slot in range(400):
-        scenario.advance(slot, swarm)
-        senders = swarm.begin(slot)
-        swarm.fly(slot)
-        verdict = channel.arbitrate(slot, [swarm.ids[index] for index in senders])
-        mask = verdict.mask(6)
-        for row, index in enumerate(senders):
-            swarm.hear(slot, swarm.frame(index), mask[row])
-        swarm.end(slot)
-        metrics.update(slot, swarm.track, swarm, verdict.outcome)
+    for slot, outcome in flown(swarm, air, 400):
+        metrics.update(slot, swarm.track, swarm, outcome)
         for mover in np.flatnonzero((begin <= slot) & ~arrived):
             told = [int(swarm.sent_slot[other, mover]) for other in range(6) if other != mover]
             ages += [slot - max(sent, begin[mover] - 1) for sent in told]
@@ -212,14 +209,10 @@ def test_a_mover_that_nobody_hears_is_in_no_age_but_in_those_from_waking_on() ->
     scenario = make_scenario(config)
     swarm, metrics = Swarm(config, scenario), FlightMetrics(RunConfig(config, limits=RunLimits(tail_s=100.0)), scenario)
     changes, legs = 0, [-1] * 4
-    for slot in range(300):
-        scenario.advance(slot, swarm)
+    for slot, outcome in flown(swarm, ChannelConfig(agents=4, slot_ns=config.slot_ns, jam=True), 300):
         changes += sum(int(leg) != old for leg, old in zip(swarm.course.leg, legs, strict=True))
         legs = swarm.course.leg.tolist()
-        swarm.begin(slot)
-        swarm.fly(slot)
-        swarm.end(slot)
-        metrics.update(slot, swarm.track, swarm, IDLE)
+        metrics.update(slot, swarm.track, swarm, outcome)
     summary = metrics.summary()
     assert summary["age_mean_slots"] is None
     assert changes > 4
