@@ -34,7 +34,7 @@ static void lose(const sim_losses *o, int n, int64_t slot, int sender, uint8_t *
     const uint8_t *phase = o->chains ? o->phase + (o->chains == 1 ? 0 : (long)sender * n) : NULL;
     for (int k = 0; k < n; k++) {
         const int is_bad = phase && phase[k];
-        received[k] = phase && o->certain ? !is_bad : words[k] * factor >= (is_bad ? bad : good)[k];
+        received[k] = words[k] * factor >= (is_bad ? bad : good)[k];
     }
     received[sender] = 0;
 }

@@ -10,7 +10,6 @@ enum { SIM_IDLE, SIM_SUCCESS, SIM_COLLISION }; /* outcomes of a slot */
  * of senders and receivers are (n, n), row = sender. */
 typedef struct sim_losses {
     int none;      /* nothing is ever lost */
-    int certain;   /* in a bad phase all is lost, in a good one nothing */
     int chains;    /* 0: no phases, 1: one chain of phases a receiver, n: one a link */
     int64_t first; /* slot of the first row of words */
     /* Borrowed: */

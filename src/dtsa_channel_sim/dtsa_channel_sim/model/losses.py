@@ -75,7 +75,7 @@ class Losses:
             senders = range(1, words.agents + 1) if self._per_link else (0,)
             arrays |= self._chains.arrays(senders, slot - 1)
             arrays |= {"state_words": states.block(number), "state_factors": np.array(states.factors[1:])}
-            losses.chains, losses.certain = len(senders), self._certain
+            losses.chains = len(senders)
         self._lent = {name: memory(array) for name, array in arrays.items()}
         for name, lent in self._lent.items():
             setattr(losses, name, lent)
