@@ -228,6 +228,8 @@ class FlightMetrics:
         efficiency = list(self.efficiencies().values())
         airtime = self.run.air.airtime
         on_air_s = sum(airtime.on_air_ns(length) * count for length, count in self._frames.items()) / 1e9
+        # Who sends at any instant expects no agent in a slot.
+        agreement = None if swarm.policy_row.unslotted else 1.0 - sums.torn / max(1, sums.compared)
         outcomes = {"success": SUCCESS, "collision": COLLISION, "idle": IDLE}
         return {
             "agents": swarm.agents, "moving": swarm.movers, "policy": swarm.policy, "estimator": swarm.estimator,
@@ -243,8 +245,8 @@ class FlightMetrics:
             "completion_time_s": sums.completion_slot * swarm.slot_ns / 1e9 if complete else None,
             "flight_time_s": flown,
             "first_divergence_slot": sums.split_slot if sums.split_slot >= 0 else None,
-            "equal_tables_share": 1.0 - sums.split / sums.compared if sums.compared else 1.0,
-            "agreement_share": 1.0 - sums.torn / sums.compared if sums.compared else 1.0,
+            "equal_tables_share": 1.0 - sums.split / max(1, sums.compared),
+            "agreement_share": agreement,
             "lost_agents": sorted(self.lost),
             "age_mean_slots": sums.age_sum / news if news else None,
             "age_max_slots": sums.age_max if news else None,

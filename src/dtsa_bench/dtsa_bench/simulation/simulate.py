@@ -152,6 +152,7 @@ def _fly_unslotted(
     slot, over = 0, ""
     while not over:
         swarm.scenario.advance(slot, swarm)
+        swarm.digest[:] = swarm.table_hash
         carried = traffic.slot(slot)
         if log is not None:
             log.open_slot()

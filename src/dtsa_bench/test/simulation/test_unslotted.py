@@ -110,3 +110,10 @@ def test_tables_of_a_flight_that_is_over_do_not_wait_for_the_garbage_collector(s
     kept = weakref.ref(swarm)
     del swarm, traffic
     assert kept() is None
+
+
+def test_tables_differ_where_frames_are_lost_and_no_agent_expects_another() -> None:
+    summary = dtsa.simulate(agents=6, policy="csma", loss=0.2, timeout_s=1.0).summary
+    assert summary["equal_tables_share"] < 0.1
+    assert summary["first_divergence_slot"] < 20
+    assert summary["agreement_share"] is None
