@@ -129,6 +129,16 @@ def test_agents_that_have_not_reported_disagree_with_nobody(tmp_path: Path) -> N
     assert {level for one in told for level in numbers(one["frames"]["received"], "u1")} == {254}
 
 
+def test_a_crash_that_lasts_one_slot_is_seen(bag: Path) -> None:
+    def close(record: Any) -> list[tuple[str, Any]]:
+        track = record.track.reshape(-1, 3, AGENTS).copy()
+        track[:, :, 1] = track[:, :, 0]
+        return [("SlotRecord", replace(record, track=track.ravel()))] if record.slot == 52 else []
+
+    moments = history_of(bag, close, refused=False).since(0, MAX_MOMENTS)[1]
+    assert [crash for one in moments for crash in json.loads(one.text)["crashes"]] == [[52, 1, 2, 0.0]]
+
+
 def test_messages_that_cannot_be_are_refused_and_change_nothing(bag: Path, history: RunHistory) -> None:
     def wrong(record: Any) -> list[tuple[str, Any]]:
         fields = {
