@@ -344,6 +344,18 @@ def test_a_report_counts_receptions_of_agents_with_a_bag_alone(flight: SimpleNam
         assert lost[place] == pytest.approx(1 - share, abs=1e-4)
 
 
+def test_of_one_bag_nothing_is_said_that_only_others_could_say(flight: SimpleNamespace, tmp_path: Path) -> None:
+    alone = Merge([read(flight.bags[0])]).log
+    write_merged(tmp_path / "one", alone, {})
+    page, slots = run_data(tmp_path / "one"), dtsa.open(tmp_path / "one").frames.query("sender == 1").slot
+    assert alone.distances.distance_m.isna().all()
+    assert alone.merged["not_on_the_time_line"] == []
+    columns = zip(*(np.frombuffer(base64.b64decode(page["slots"][name]), kind) for name, kind in
+                    (("slot", "<u4"), ("sender", "<u2"), ("received", "u1"))), strict=True)  # fmt: skip
+    levels = {int(slot): int(level) for slot, sender, level in columns if sender == 1}
+    assert levels == dict.fromkeys(slots.tolist(), 255)  # who received its frames is not known
+
+
 def test_merge_keeps_the_whole_flight_or_nothing(flight, tmp_path, monkeypatch, capsys):
     """Of a bag that breaks off what is whole is kept, and nothing is made up for the rest."""
     cut = tmp_path / "cf1.mcap"
