@@ -30,24 +30,27 @@ def lossy_bag(directory: Path) -> Path:
     return bag
 
 
-def history_of(bag: Path, wrong: Callable[[Any], Sequence[tuple[str, Any]]] = lambda record: ()) -> RunHistory:
+def history_of(
+    bag: Path, more: Callable[[Any], Sequence[tuple[str, Any]]] = lambda record: (), refused: bool = True
+) -> RunHistory:
     """All of a lockstep bag, as a page gets it from the ROS graph while it is flown.
 
-    :param wrong: messages, and their kinds, that come before a slot's record and are refused.
+    :param more: messages, and their kinds, that come before a slot's record.
+    :param refused: whether they are.
     """
     history = RunHistory("lossy")
-    follower, refused = Follower(history, {}), 0
+    follower, count = Follower(history, {}), 0
     with Bag(bag) as opened:
         follower.start(opened.config)
         for _, record in opened.typed([SLOT_RECORD]):
             if not len(record.chosen):  # where all are at the end
                 continue
-            messages = wrong(record)
-            refused += len(messages)
+            messages = more(record)
+            count += refused * len(messages)
             for kind, message in (*messages, ("SlotRecord", record)):
                 follower.receive(kind, message)
     follower.finish("recorded")
-    assert follower.unusable == refused
+    assert follower.unusable == count
     return history
 
 

@@ -79,13 +79,13 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
         warn(f"the demo was interrupted; what was flown is in {directory}")
         return INTERRUPTED, directory
     good = [_is_verified(key, directory / key) for key in flights]
+    print("\n" + aligned([HEAD, *table_rows(steps, flights)], rule=True) + "\n", flush=True)
     numbers = {key: dict(finished.summary) for key, finished in flights.items()}
     (directory / NUMBERS).write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
     print("drawing the picture and the page ...", file=sys.stderr, flush=True)
     _draw(steps, flights, directory, args.animation)
     compared = [directory / key for key, finished in flights.items() if not finished.flight.live]
     page = write_report(compared, directory / "demo.html")
-    print("\n" + aligned([HEAD, *table_rows(steps, flights)], rule=True) + "\n")
     print(f"picture    {directory / 'demo.png'}\nflights    {directory}/{{{','.join(flights)}}}")
     for text, command in _next_commands(directory):
         print(f"{text:44} {command}")
@@ -110,15 +110,15 @@ def _is_verified(key: str, bag: Path) -> bool:
 def _draw(steps: Any, flights: Mapping[str, FinishedFlight], directory: Path, animation: bool) -> None:
     from dtsa_bench.drawing import optional_picture
 
-    with optional_picture(directory / "demo.png"):
+    with optional_picture(directory / "demo.png") as file:
         from dtsa_bench.pages.demo.picture import draw_demo
 
-        draw_demo(directory / "demo.png", steps, flights)
+        draw_demo(file, steps, flights)
     if animation:
-        with optional_picture(directory / "demo.gif"):
+        with optional_picture(directory / "demo.gif") as file:
             from dtsa_bench.pages.demo.picture import draw_animation
 
-            draw_animation(directory / "demo.gif", flights)
+            draw_animation(file, flights)
 
 
 def _next_commands(directory: Path) -> list[tuple[str, str]]:

@@ -58,18 +58,20 @@ and seed every slot has the same sender and every quadcopter the same positions 
         flight = simulate(config, log=picture is not None)
         summary = flight.summary()
         text = json.dumps(summary, indent=2) + "\n"
-        if directory is not None:
-            settings = json.dumps(config.to_dict(), indent=2) + "\n"
-            for name, content in (("summary.json", text), ("config.json", settings)):
-                (directory / name).write_text(content, encoding="utf-8")
-        print(text if args.json else describe(summary), end="")
+        try:
+            if directory is not None:
+                settings = json.dumps(config.to_dict(), indent=2) + "\n"
+                for name, content in (("summary.json", text), ("config.json", settings)):
+                    (directory / name).write_text(content, encoding="utf-8")
+        finally:  # also on a full disk
+            print(text if args.json else describe(summary), end="", flush=True)
         if picture is not None and flight.log is not None:
             from dtsa_bench.drawing import optional_picture
 
-            with optional_picture(picture):
+            with optional_picture(picture) as part:
                 from dtsa_bench.drawing.flight_paths import draw_flight
 
-                draw_flight(picture, flight.scenario, flight.log.positions(), summary)
+                draw_flight(part, flight.scenario, flight.log.positions(), summary)
                 print(f"picture: {picture}", file=sys.stderr)
         return 0
 

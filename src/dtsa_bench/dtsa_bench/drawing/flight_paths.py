@@ -129,9 +129,11 @@ def svg_from_above(path: Track, moving: NDArray[np.bool_], name: str, crash: Seq
 
 def _subtitle(summary: dict[str, Any]) -> str:
     """The results of a flight in one short line."""
-    end = "crashed" if summary["collided"] else "complete" if summary["completed"] else summary["end"]
-    key = "completion_time_s" if end == "complete" else "flight_time_s"
-    parts = [f"{end} after {summary[key]:.2f} s"]
+    is_complete = summary["completed"] and summary["end"] != "crashed"
+    after = summary["completion_time_s" if is_complete else "flight_time_s"]
+    parts = [f"{'complete' if is_complete else summary['end']} after {after:.2f} s"]
+    if summary["collided"] and summary["end"] != "crashed":
+        parts.append("agents {} and {} crashed".format(*summary["collided_pair"]))
     if summary["min_distance_m"] is not None:
         parts.append(f"closest {summary['min_distance_m']:.3f} m")
     if summary["efficiency_mean"] is not None:

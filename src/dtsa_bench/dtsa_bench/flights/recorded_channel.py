@@ -108,8 +108,7 @@ class RecordedFlight:
         (self.directory / "summary.json").write_text(text, encoding="utf-8")
         path = self.measurement.positions.array()
         if len(path) and pictures:
-            picture = self.directory / "trajectories.png"
-            with optional_picture(picture):
+            with optional_picture(self.directory / "trajectories.png") as picture:
                 from dtsa_bench.drawing.flight_paths import draw_flight
 
                 draw_flight(picture, self.scenario, path, summary)

@@ -208,11 +208,26 @@ class FlightArrays:
 
     @cached_property
     def known_receivers(self) -> NDArray[np.int64]:
-        """(F,) other agents of which is known whether they received a frame."""
+        """(F,) other agents of which is known whether they lost a frame; the channel counts absent ones, too."""
         frames = self.sent_frames
         if self.merged is None:
             return np.full(len(frames.row), max(0, self.agents - 1), np.int64)
         return np.asarray(frames.received.sum(axis=1) + frames.lost, np.int64)
+
+    @cached_property
+    def receivers(self) -> Mask:
+        """(F, N) other agents that were there, and of which is known whether they received a frame."""
+        frames = self.sent_frames
+        others = np.arange(1, self.agents + 1) != frames.sender[:, None]
+        if self.merged is not None:
+            return np.asarray(others & (frames.received | self.known[frames.row]))
+        return others if self.absent is None else others & ~self.absent[frames.row]
+
+    @cached_property
+    def sender_known(self) -> Mask:
+        """(F,) frames of which there is a record of the sender; others are known only because an agent heard them."""
+        frames = self.sent_frames
+        return self.known[frames.row, frames.sender - 1] | (self.merged is None)
 
     @cached_property
     def _instants(self) -> tuple[Floats, Floats, Floats]:

@@ -153,7 +153,7 @@ class _WholeReplay(TableReplay):
             sizes = [len(data) for data in sent.data[frames]]
             metrics.update(row, track[row + 1], self.tables, outcome if outcome < UNKNOWN else 0, sizes)
             self.estimate(row + 1, track[row + 1, -1])
-            yield KnownSlot(row, row, self.tables, track[row + 1, -1], metrics.counted, row >= log.agents)
+            yield KnownSlot(row, row, self.tables, track[row + 1, -1], metrics.counted, row + 1 >= log.agents)
 
     def _note_absent(self, row: int) -> None:
         """Agents come and go before a slot, as in flight."""

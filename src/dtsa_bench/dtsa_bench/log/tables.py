@@ -27,7 +27,11 @@ if TYPE_CHECKING:
 FORMATS = ("parquet", "csv")
 ROWS = 1 << 20  # rows of a table that are in memory at once, while it is written
 AXES = "xyz"
-_PAIR = "whether the pair counts in the results: the observer still has the agent in A_p, and the agent moves"
+_PAIR = (
+    "whether the pair counts in the results: the observer still has the agent in A_p, and the agent moves (merged: and "
+    "the slot is one of the results)"
+)
+_RESULTS = "the slot at whose end this holds; the results count from slot N - 1 on (merged: those that its notes name)"
 
 # Columns by table: name, unit, meaning.
 COLUMNS: dict[str, list[tuple[str, str, str]]] = {
@@ -55,7 +59,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("slot", "1", "slot in which the frame was sent"),
         ("time_s", "s", "start of that slot"),
         ("sender", "", "id of the agent that sent it"),
-        ("receiver", "", "id of another agent"),
+        ("receiver", "", "id of another agent that was there"),
         ("received", "", "whether that one received it; empty: not known"),
     ],
     "decisions": [
@@ -74,7 +78,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         *((f"velocity_{axis}_mps", "m/s", f"true velocity {axis}, frame map") for axis in AXES),
     ],
     "ages": [
-        ("slot", "1", "the slot at whose end this holds; the results count from slot N - 1 on"),
+        ("slot", "1", _RESULTS),
         ("time_s", "s", "end of that slot"),
         ("agent", "", "id of the agent that is known"),
         ("observers", "1", "how many others have it in A_p and have heard it; 0 for agents that hover"),
@@ -82,7 +86,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("error_m", "m", "mean distance between where they take it to be and where it is; empty without observers"),
     ],
     "ages_by_observer": [
-        ("slot", "1", "the slot at whose end this holds; the results count from slot N - 1 on"),
+        ("slot", "1", _RESULTS),
         ("time_s", "s", "end of that slot"),
         ("observer", "", "id of the agent that knows"),
         ("agent", "", "id of the agent that is known; rows begin when the observer first hears it"),
@@ -92,7 +96,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
     ],
     "distances": [
         ("time_s", "s", "control instant, counted from the start of slot 0"),
-        ("distance_m", "m", "smallest distance of any two agents"),
+        ("distance_m", "m", "smallest distance of any two agents; empty: not known"),
     ],
 }  # fmt: skip
 _TEXTS = ("outcome", "reason", "data")
@@ -150,7 +154,7 @@ def _frames(log: FlightArrays) -> Columns:
     c_r, *vectors = np.array([_decode(data, extent) for data in plain], np.float64).reshape(-1, 7).T
     unknown = np.isnan(c_r)
     return (
-        frames.row, log.time_s(frames.row), frames.sender, frames.received.sum(axis=1), frames.lost,
+        frames.row, log.time_s(frames.row), frames.sender, log.reached.sum(axis=1), frames.lost,
         _masked(frames.collided, np.full(len(frames.row), log.merged is not None or log.unslotted)),
         np.array([len(data) for data in frames.data], np.int64), np.array([data.hex() for data in frames.data], object),
         _masked(np.where(unknown, -1, c_r).astype(np.int64), unknown), *vectors,
@@ -168,10 +172,9 @@ def _decode(data: bytes, extent_m: float) -> tuple[float, ...]:
 
 def _receptions(log: FlightArrays) -> Columns:
     frames, ids = log.sent_frames, np.arange(1, log.agents + 1)
-    row, column = np.nonzero(ids[None, :] != frames.sender[:, None])
-    slots, received = frames.row[row], frames.received[row, column]
-    unknown = ~(received | log.known[slots, column]) if log.merged is not None else np.zeros(len(row), np.bool_)
-    return slots, log.time_s(slots), frames.sender[row], ids[column], _masked(received, unknown)
+    row, column = np.nonzero(log.receivers if log.merged is None else ids != frames.sender[:, None])
+    slots, received = frames.row[row], _masked(frames.received[row, column], ~log.receivers[row, column])
+    return slots, log.time_s(slots), frames.sender[row], ids[column], received
 
 
 def _decisions(log: FlightArrays) -> Columns:
@@ -217,7 +220,7 @@ def _distances(log: FlightArrays) -> Columns:
     for k in range(path.shape[2] - 1):
         between = np.linalg.norm(path[:, :, k + 1 :] - path[:, :, k : k + 1], axis=1)
         closest = np.fmin(closest, np.nanmin(between, axis=1, initial=np.inf))
-    return log.instants_s, closest
+    return log.instants_s, np.where(np.isfinite(closest), closest, np.nan)
 
 
 _BUILDERS: Mapping[str, Callable[[FlightArrays], Columns]] = {

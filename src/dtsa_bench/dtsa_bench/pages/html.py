@@ -62,10 +62,14 @@ def render_page(
 
 
 def write_page(path: Path, page: str) -> None:
-    """Writes a page so that a reader never sees half of it."""
+    """Writes a page whole or not at all: no reader sees half of it."""
     part = path.with_name(path.name + ".part")
-    part.write_text(page, encoding="utf-8")
-    part.replace(path)
+    try:
+        part.write_text(page, encoding="utf-8")
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def flatten(config: Mapping[str, Any], section: str = "") -> list[list[Any]]:

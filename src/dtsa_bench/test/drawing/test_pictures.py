@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,15 +10,19 @@ from pathlib import Path
 
 import pytest
 
+SETTINGS = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+FULL_DISK = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), -1))  # no file gets larger, as on a disk that is full
+from dtsa_bench.commands.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
 FLY = ["fly", "--agents", "2", "--processes", "1", "--timeout-s", "0.5", "--out", "run"]
 
 
 def dtsa(directory: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "dtsa_bench", *words]
-    path = os.pathsep.join(sys.path)
-    return subprocess.run(
-        command, cwd=directory, env={**os.environ, "PYTHONPATH": path, **environment}, capture_output=True, text=True
-    )
+    return subprocess.run(command, cwd=directory, env=SETTINGS | environment, capture_output=True, text=True)
 
 
 @pytest.mark.parametrize(("words", "picture"), [
@@ -40,3 +45,15 @@ def test_a_users_latex_does_not_reach_a_picture_and_a_broken_matplotlib_costs_th
     assert f"dtsa: warning: no {Path(picture).name}: Key backend: 'nonsense'" in broken.stderr
     assert "Traceback" not in broken.stderr
     assert f"picture: {picture}" not in broken.stdout + broken.stderr
+
+
+def test_a_full_disk_costs_no_results_and_leaves_no_half_picture(tmp_path: Path) -> None:
+    words = ["simulate", "--agents", "4", "--timeout-s", "0.5", "--json", "--picture", "a.png"]
+    results = []
+    for limit, more, code in ((10, ["--out", "flown"], 1), (5000, [], 0)):
+        command = [sys.executable, "-c", FULL_DISK, str(limit), *words, *more]
+        done = subprocess.run(command, cwd=tmp_path, env=SETTINGS, capture_output=True, text=True)
+        assert done.returncode == code, done.stderr
+        results.append(json.loads(done.stdout)["slots"])
+        assert [path.name for path in tmp_path.glob("*png*")] == []
+    assert results[0] == results[1] == {"total": 50, "success": 50, "collision": 0, "idle": 0}

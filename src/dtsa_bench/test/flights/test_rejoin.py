@@ -56,7 +56,10 @@ class Report:
 
 def assert_told_alike(summary: dict[str, Any], out: Path) -> None:
     """What a bag says of a flight is what the flight has said of itself, whoever came, went and came back."""
-    told = load_log(out).summary
+    log = load_log(out)
+    told, heard = log.summary, log.receptions
+    assert log.absent is None or not log.absent[heard.slot, heard.receiver - 1].any()
+    assert heard.groupby(["slot", "sender"]).received.sum().tolist() == log.frames.received.tolist()
     for name in ("end", "completed", "collided", "lost_agents", "min_distance_pair", "wakings"):
         assert told[name] == summary[name], name
     for name in ("min_distance_m", "age_mean_slots", "agreement_share", "waking_age_mean_slots"):

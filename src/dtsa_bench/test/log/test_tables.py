@@ -155,19 +155,24 @@ SMALL_DISK = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, -1))  # no file gets larger, as on a disk that is full
 from dtsa_bench.commands.cli import main
-sys.exit(main(["export", *sys.argv[1:]]))
+sys.exit(main(sys.argv[1:]))
 """
 
 
 @pytest.mark.parametrize("kind", ["parquet", "csv"])
-def test_a_full_disk_leaves_no_half_table(flight: Path, tmp_path: Path, kind: str) -> None:
+def test_a_full_disk_leaves_no_half_table_and_no_half_page(flight: Path, tmp_path: Path, kind: str) -> None:
     (tmp_path / "mine").mkdir()
     for place in ("mine", "new"):
-        words = [sys.executable, "-c", SMALL_DISK, str(flight), "--to", kind, "--out", str(tmp_path / place)]
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-        assert done.returncode == 1
-        assert done.stderr.startswith(f"dtsa: error: cannot export to {tmp_path / place}: ")
-        assert done.stderr.count("\n") == 1
+        for words, text in (
+            (["export", flight, "--to", kind, "--out", tmp_path / place], "export to"),
+            (["report", flight, "--out", tmp_path / place], "write"),
+        ):
+            if words[0] == "report" and place == "mine":
+                continue
+            done = subprocess.run([sys.executable, "-c", SMALL_DISK, *map(str, words)], capture_output=True, text=True)
+            assert done.returncode == 1
+            assert done.stderr.splitlines()[-1].startswith(f"dtsa: error: cannot {text} {tmp_path / place}: ")
+            assert done.stderr.count("dtsa: error") == 1
     assert [path.name for path in tmp_path.rglob("*")] == ["mine"]  # was there before, and is empty as before
 
 

@@ -31,6 +31,7 @@ from dtsa_agent.core.station import StationSettings
 from dtsa_agent.stop import Stop
 from dtsa_bench.commands.cli import main
 from dtsa_bench.log.agent_bag import read
+from dtsa_bench.log.arrays import ReceivedFrames
 from dtsa_bench.log.bag.metadata import MERGED_FROM
 from dtsa_bench.log.bag.reader import Bag
 from dtsa_bench.log.bag.recover import recover
@@ -321,6 +322,38 @@ def test_a_merged_flight_is_kept_as_a_bag_in_which_nothing_is_known_of_who_has_n
     assert page["summary"]["slots"]["idle"] == 0
     assert page["table"][3].keys() & {"path", "heard"} == {"heard"}
     assert page["table"][3]["heard"] is None
+
+
+def test_a_report_counts_receptions_of_agents_with_a_bag_alone(flight: SimpleNamespace, tmp_path: Path) -> None:
+    """A frame of another one is known because it was heard: of such ones too many were received."""
+    bags, draw = [read(path) for path in flight.bags[:2]], np.random.default_rng(1)
+    for bag in bags:
+        row, *others, data = bag.log.heard
+        kept = np.flatnonzero(draw.random(len(row)) < 0.5)
+        columns = (values[kept] for values in (row, *others))
+        bag.log.heard = ReceivedFrames(*columns, [data[k] for k in kept.tolist()])
+    write_merged(tmp_path / "two", Merge(bags).log, {})
+    page, known = run_data(tmp_path / "two"), dtsa.open(tmp_path / "two").receptions.dropna().astype(int)
+    assert set(known.sender) == {1, 2, 3}
+    known = known[known.sender < 3]
+    assert page["summary"]["lost_fraction"] == pytest.approx(1 - known.received.mean(), abs=1e-12)
+    received = known.groupby("sender").received.mean()
+    assert [row["heard"] for row in page["table"]] == [*(pytest.approx(one, abs=1e-4) for one in received), None, None]
+    lost = page["channel"]["lost"]
+    for place, share in known.groupby(known.slot * len(lost) // page["slots"]["count"]).received.mean().items():
+        assert lost[place] == pytest.approx(1 - share, abs=1e-4)
+
+
+def test_of_one_bag_nothing_is_said_that_only_others_could_say(flight: SimpleNamespace, tmp_path: Path) -> None:
+    alone = Merge([read(flight.bags[0])]).log
+    write_merged(tmp_path / "one", alone, {})
+    page, slots = run_data(tmp_path / "one"), dtsa.open(tmp_path / "one").frames.query("sender == 1").slot
+    assert alone.distances.distance_m.isna().all()
+    assert alone.merged["not_on_the_time_line"] == []
+    columns = zip(*(np.frombuffer(base64.b64decode(page["slots"][name]), kind) for name, kind in
+                    (("slot", "<u4"), ("sender", "<u2"), ("received", "u1"))), strict=True)  # fmt: skip
+    levels = {int(slot): int(level) for slot, sender, level in columns if sender == 1}
+    assert levels == dict.fromkeys(slots.tolist(), 255)  # who received its frames is not known
 
 
 def test_merge_keeps_the_whole_flight_or_nothing(flight, tmp_path, monkeypatch, capsys):

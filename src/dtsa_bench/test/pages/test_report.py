@@ -128,6 +128,17 @@ def test_shares_add_up_and_ages_follow_from_who_was_heard(data: dict[str, Any]) 
     assert sum(row["sent"] for row in rows) == clean["frames"]
 
 
+def test_figures_of_agents_are_means_over_the_pairs_of_the_results(flights, data):
+    for name, path in flights.items():
+        known = load_log(path).ages_by_observer.query("counted and slot >= 5")
+        assert known.age_slots.mean() == pytest.approx(data[name]["summary"]["age_mean_slots"], rel=1e-12)
+        of = known.groupby("agent")
+        for row in data[name]["table"]:
+            if row["moving"]:
+                assert row["age_mean"] == pytest.approx(of.age_slots.mean()[row["id"]], abs=0.0051)
+                assert row["error_mean"] == pytest.approx(of.error_m.mean()[row["id"]], abs=0.000051)
+
+
 def test_distances_and_scene_are_those_of_the_positions(flights: dict[str, Path], data: dict[str, Any]) -> None:
     with Bag(flights["lossy"]) as bag:
         run = load_log(bag)

@@ -24,7 +24,9 @@ from browser_helpers import serving
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.log.record import load_log
+from dtsa_bench.log.bag.reader import Bag
+from dtsa_bench.log.record import SLOT_RECORD, load_log
+from dtsa_bench.pages.view.follower import Follower
 from dtsa_bench.pages.view.history import (
     MAX_BYTES,
     MAX_FRAMES,
@@ -86,6 +88,55 @@ def test_ages_and_beliefs_are_those_of_the_report(bag: Path, history: RunHistory
             heard = np.frombuffer(moment.belief(observer, AGENTS)[0], "<u2")
             rows = table[(table.slot == moment.slot - 1) & (table.observer == observer)]
             assert heard[rows.agent - 1].tolist() == rows.age_slots.tolist()
+
+
+def test_agents_that_do_not_take_part_are_in_no_age(bag: Path) -> None:
+    """What a killed one has heard does not grow old, and of itself nobody expects anything."""
+
+    def killed(record: Any) -> list[tuple[str, Any]]:
+        if record.slot != SLOTS // 2:
+            return []
+        status = {"slot": record.slot, "lost": [2], "lag_ms": 0.0, "phase": 1, "reason": ""}
+        return [("RunStatus", SimpleNamespace(**status))]
+
+    moments = history_of(bag, killed, refused=False).since(0, MAX_MOMENTS)[1]
+    known = load_log(bag).ages_by_observer.query("counted and observer != 2 and agent != 2")
+    for moment in moments[-3:]:
+        told = numbers(json.loads(moment.text)["age"], "<u2") / 10
+        means = known[known.slot == moment.slot - 1].groupby("agent").age_slots.mean()
+        assert told[means.index - 1] == pytest.approx(means.to_numpy(), abs=0.051)
+        assert told[1] == UNKNOWN / 10
+
+
+def test_agents_that_have_not_reported_disagree_with_nobody(tmp_path: Path) -> None:
+    """Neither are they receivers once it is known that they are silent."""
+    flight_bag(tmp_path / "bag", slots=60, agents=4, policy="tdma", seed=1)
+    history, by_agent = RunHistory("killed"), ("chosen", "digest", "reason", "track")
+    follower = Follower(history, {})
+    with Bag(tmp_path / "bag") as opened:
+        follower.start(opened.config)
+        for _, record in list(opened.typed([SLOT_RECORD]))[:-1]:
+            if record.slot == 40:
+                status = {"slot": 40, "lost": [2], "lag_ms": 0.0, "phase": 1, "reason": ""}
+                follower.receive("RunStatus", SimpleNamespace(**status))
+            here = np.array([0, 2, 3]) if record.slot >= 30 else np.arange(4)
+            fields = {name: getattr(record, name).reshape(-1, 4)[:, here].ravel() for name in by_agent}
+            follower.receive("SlotRecord", replace(record, agent=record.agent[here], **fields))
+    follower.finish("recorded")
+    told = [json.loads(moment.text) for moment in history.since(0, MAX_MOMENTS)[1]]
+    assert np.sum([one["agree"] for one in told], axis=0).tolist() == [60, 60]
+    assert {one["tables"] for one in told} == {1}
+    assert {level for one in told for level in numbers(one["frames"]["received"], "u1")} == {254}
+
+
+def test_a_crash_that_lasts_one_slot_is_seen(bag: Path) -> None:
+    def close(record: Any) -> list[tuple[str, Any]]:
+        track = record.track.reshape(-1, 3, AGENTS).copy()
+        track[:, :, 1] = track[:, :, 0]
+        return [("SlotRecord", replace(record, track=track.ravel()))] if record.slot == 52 else []
+
+    moments = history_of(bag, close, refused=False).since(0, MAX_MOMENTS)[1]
+    assert [crash for one in moments for crash in json.loads(one.text)["crashes"]] == [[52, 1, 2, 0.0]]
 
 
 def test_messages_that_cannot_be_are_refused_and_change_nothing(bag: Path, history: RunHistory) -> None:

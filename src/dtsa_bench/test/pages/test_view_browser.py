@@ -60,6 +60,29 @@ def test_chromium_plays_a_run_and_shows_what_an_agent_believes(tmp_path: Path) -
         assert browser.complaints() == []
 
 
+LONG_RUN = """import("./run.js").then(({LiveRun}) => {
+  const pack = values => btoa(String.fromCharCode(...new Uint8Array(values.buffer)));
+  const box = [[0, 0, 0], [1, 1, 1]], ones = pack(new Uint8Array(4000).fill(1)), one = pack(new Uint16Array(1));
+  const run = new LiveRun({agents: 1, slot_s: 0.01, box, target: [[0, 0, 0]], reasons: [], moving: [true]});
+  const senders = pack(new Uint16Array(4000).fill(1));
+  for (let slot = 4000; slot <= 280000; slot += 4000) {
+    const slots = pack(Uint32Array.from({length: 4000}, (_, k) => slot - 4000 + k));
+    const frames = {slot: slots, sender: senders, outcome: ones, reason: ones, received: ones};
+    run.take(slot / 4000, [{slot, at: "", place: "", frames, agree: [0, 0], tables: 0, age: one, chosen: one,
+      absent: [], events: [], crashes: []}]);
+  }
+  return [run.record.first === run.record.slot[0], run.record.first > 0, run.record.first + run.record.count];
+})"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+def test_the_slots_of_a_long_run_end_with_the_newest(tmp_path: Path) -> None:
+    with serving(ViewServer(history_of(lossy_bag(tmp_path)), "some-token")) as url, browsing() as browser:
+        browser.open(url)
+        browser.wait_for("dtsa.live.view.run.record.count >= 150")
+        assert browser.run(LONG_RUN) == [True, True, 280_000]
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def test_chromium_shows_what_crazyflies_say_as_text(tmp_path: Path) -> None:
     recorded = history_of(lossy_bag(tmp_path))

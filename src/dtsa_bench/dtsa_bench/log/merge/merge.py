@@ -76,7 +76,7 @@ class Merge:
         zero_ns, slot_ns = starts.line()
         summary = self.line.summary()
         about = {
-            **self._about_bags(),
+            **self._about_bags(clocks),
             "frames_heard_not_as_sent": self.unmatched,
             "residual_us": {name: value or 0.0 for name, value in summary["residual_us"].items()},
             "clocks": summary["clocks"],
@@ -92,13 +92,13 @@ class Merge:
         times = {process: to_common(clocks[process]) for process in on_line}
         return _join(on_line, times, starts.common_slot, round(self.line.flight_ns), about)
 
-    def _about_bags(self) -> dict[str, Any]:
-        here, line = {agent for agent, _ in self.processes}, self.line.clocks
+    def _about_bags(self, clocks: Mapping[Process, Clock]) -> dict[str, Any]:
+        here = {agent for agent, _ in self.processes}
         return {
             "missing": [agent for agent in range(1, self.config.agents + 1) if agent not in here],
             "broken_off": [process_name(process) for process, bag in self.processes.items() if bag.broken_off],
             "nothing_written": self.nothing_written,
-            "not_on_the_time_line": [process_name(one) for one in self.processes if one not in line and one[1] >= 0],
+            "not_on_the_time_line": [process_name(one) for one in self.processes if one not in clocks and one[1] >= 0],
             "not_determined": self.apart,
         }
 
@@ -125,7 +125,7 @@ class Merge:
         return {
             "bags": sum(number >= 0 for _, number in processes),
             "slots_of_times_given_up": sum(lengths[k] for k, (_, number) in enumerate(processes) if number < 0),
-            **self._about_bags(),
+            **self._about_bags(line.clocks),
             "time_line": line.summary(),
             **self._starts.summary(),
             "frames_sent": len(sent),

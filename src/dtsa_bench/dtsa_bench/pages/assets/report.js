@@ -27,7 +27,7 @@ const FIGURES = [
   ["Completion time", run => num(run.summary.completion_time_s, 2, "s"), run => `flown ${num(run.duration_s, 2, "s")}`],
   ["Smallest distance", run => num(run.summary.min_distance_m, 3, "m"), run => run.summary.min_distance_pair ? `agents ${run.summary.min_distance_pair.join(" and ")}` : "", run => run.summary.collided ? "bad" : ""],
   ["Path efficiency", run => percent(run.summary.efficiency_mean), () => "way over path, movers"],
-  ["Slots", run => whole(run.summary.slots.total), run => `${num(1000 * run.slot_s, run.slot_s < 0.001 ? 2 : 0, "ms")} each`],
+  ["Slots", run => whole(run.summary.slots.total), run => `${(1000 * run.slot_s).toLocaleString("en", {maximumFractionDigits: 3})}\u202fms each`],
   ["Collided slots", run => whole(run.summary.slots.collision), run => percent(run.summary.slots.total ? run.summary.slots.collision / run.summary.slots.total : null), run => run.summary.slots.collision ? "bad" : ""],
   ["Idle slots", run => whole(run.summary.slots.idle), run => percent(run.summary.slots.total ? run.summary.slots.idle / run.summary.slots.total : null)],
   ["Lost to noise", run => percent(run.summary.lost_fraction, 2), () => "of all receptions"],
@@ -161,7 +161,7 @@ for (const [key, title, what, unit, digits, suffix, axis] of [
 }
 const COLUMNS = [["id", "agent", whole], ["sent", "frames sent", whole], ["heard", "received by", value => percent(value)], ["collided", "collided", whole], ["age_mean", "age, mean (slots)", value => num(value, 1)],
   ["age_max", "age, most (slots)", value => num(value, 1)], ["error_mean", "error, mean", length], ["error_max", "error, most", length], ["path", "path (m)", value => num(value, 2)]];
-section("Agents", "Ages and errors are means over the agent's observers, after the first round.", {
+section("Agents", "Ages and errors in the slots that the results count: means over all observers of the agent, and the slot in which the mean over its observers was largest.", {
   draw: run => el("div", {class: "scroll tall"}, el("table", {},
     el("thead", {}, el("tr", {}, ...COLUMNS.map(([, title]) => el("th", {}, title)))),
     el("tbody", {}, ...run.table.map(row => el("tr", {}, ...COLUMNS.map(([key, , text]) => el("td", {}, key === "id" && row.moving === false ? `${row.id} (hovers)` : text(row[key]))))))))

@@ -123,7 +123,7 @@ export class LiveRun {
     record.places.set(place, 3 * n * from);
     for (let k = 0; k < at.length; k++) record.times[from + k] = at[k] * this.slot_s;
     this.takeFrames(moment.frames);
-    record.count = Math.max(record.count, moment.slot - record.first);
+    record.count = moment.slot - record.first;
     const held = this.moments, row = held.more(1), near = record.frames ? closestOf(record.places, 3 * n * (record.frames - 1), n, this.scene.ids) : null;
     held.at[row] = time; held.compared[row] = moment.agree[0]; held.same[row] = moment.agree[1]; held.tables[row] = moment.tables;
     held.lag[row] = moment.lag_ms ?? 0; held.refused[row] = moment.refused ?? 0; held.told[row] = 0;

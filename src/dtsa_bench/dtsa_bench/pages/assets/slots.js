@@ -19,6 +19,9 @@ class SlotLine {
     return this.record.reason[index] < 255 ? reasonColor(this.run.decisions.names[this.record.reason[index]]) : theme.color("success");
   }
 
+  /* Share of the receivers that received a frame; null: not known. */
+  received(index) { const level = this.record.received[index]; return level === 255 ? null : level / 254; }
+
   point(canvas, range) {
     const slotAt = event => {
       const box = canvas.getBoundingClientRect(), [first, count] = range();
@@ -43,7 +46,7 @@ class SlotLine {
     const rows = [`slot ${whole(slot)}, ${num(slot * this.run.slot_s, 3, "s")}`];
     for (let i = this.find(slot); i < this.record.sent && this.record.slot[i] === slot; i++) {
       const why = this.record.reason[i] < 255 ? this.run.decisions.names[this.record.reason[i]] : "";
-      rows.push(`agent ${this.record.sender[i]}: ${this.record.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.record.received[i] / 255, 0)}`);
+      rows.push(`agent ${this.record.sender[i]}: ${this.record.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.received(i), 0)}`);
       if (why) rows.push(`  ${why}${reasonText(why) ? ": " + reasonText(why) : ""}`);
     }
     if (rows.length === 1) rows.push(this.run.slots?.unknown?.includes(slot) ? "not known whether an agent sent" : "no agent sent");
@@ -99,7 +102,7 @@ class SlotLine {
         if ((this.record.outcome[i] === 2) !== (pass === 1)) continue;
         const x = LEFT + (this.record.slot[i] - first) * wide;
         c.fillStyle = this.color(i);
-        c.globalAlpha = this.record.outcome[i] === 2 ? 1 : 0.3 + 0.7 * this.record.received[i] / 255;
+        c.globalAlpha = this.record.outcome[i] === 2 ? 1 : 0.3 + 0.7 * (this.received(i) ?? 1);
         c.fillRect(x, top + (this.record.sender[i] - 1) * row, slim, tall);
         if (this.record.outcome[i] === 2 && slim > 6) { // a cross: not by colour alone
           const y = top + (this.record.sender[i] - 1) * row;
@@ -109,7 +112,7 @@ class SlotLine {
         c.globalAlpha = 1;
         if (this.record.outcome[i] === 2) { c.fillStyle = theme.color("collision"); c.fillRect(x, 15, slim, 8); } // taller: not by colour alone
         else { c.fillStyle = theme.color("success"); c.fillRect(x, 19, slim, 4); }
-        if (this.record.received[i] < 255 && this.record.outcome[i] !== 2 && axis) { c.fillStyle = theme.color("ink"); c.fillRect(x, top + (this.record.sender[i] - 1) * row + tall - Math.min(3, tall / 3), slim * (1 - this.record.received[i] / 255), Math.min(3, tall / 3)); }
+        if (this.received(i) < 1 && this.received(i) !== null && this.record.outcome[i] !== 2 && axis) { c.fillStyle = theme.color("ink"); c.fillRect(x, top + (this.record.sender[i] - 1) * row + tall - Math.min(3, tall / 3), slim * (1 - this.received(i)), Math.min(3, tall / 3)); }
       }
     }
     c.fillStyle = theme.color("soft"); c.textAlign = "right"; c.textBaseline = "middle";

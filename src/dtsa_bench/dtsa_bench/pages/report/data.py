@@ -93,7 +93,7 @@ def _reasons(run: FlightLog) -> _Reasons:
 
 def _counts(run: FlightLog, unknown: int) -> dict[str, Any]:
     counts = np.bincount(run.outcome[run.outcome_known], minlength=len(OUTCOMES))
-    frames, offered = run.sent_frames, int(run.known_receivers.sum())
+    frames, offered = run.sent_frames, int(run.known_receivers[run.sender_known].sum())
     return {
         "slots": {
             "total": int(run.recorded.sum()),
@@ -101,7 +101,7 @@ def _counts(run: FlightLog, unknown: int) -> dict[str, Any]:
             **({"unknown": unknown} if unknown else {}),
         },
         "frames": len(frames.row),
-        "lost_fraction": float(frames.lost.sum()) / offered if offered else 0.0,
+        "lost_fraction": float(frames.lost[run.sender_known].sum()) / offered if offered else 0.0,
     }
 
 
@@ -126,14 +126,14 @@ def _scene(run: FlightLog) -> dict[str, Any] | None:
 
 def _slots(run: FlightLog, reasons: _Reasons, unknown: list[int]) -> dict[str, Any]:
     """Every frame that was sent: in which slot, by whom, why, and what became of it."""
-    frames = run.sent_frames
-    share = frames.received.sum(axis=1) / np.maximum(1, run.known_receivers)
+    frames, receivers = run.sent_frames, run.receivers.sum(axis=1)
+    level = np.round(254 * (frames.received & run.receivers).sum(axis=1) / np.maximum(1, receivers))
     return {
         "slot": pack(frames.row.astype("<u4")),
         "sender": pack(frames.sender.astype("<u2")),
         "outcome": pack(np.minimum(run.outcome[frames.row], len(OUTCOMES) - 1)),
         "reason": pack(reasons.sent_for.astype(np.uint8)),
-        "received": pack(np.round(255 * np.minimum(share, 1)).astype(np.uint8)),
+        "received": pack(np.where(receivers > 0, level, 255).astype(np.uint8)),  # 255: not known
         **({"unknown": unknown} if unknown else {}),
         "first": 0,
         "count": len(run),
@@ -155,8 +155,9 @@ def _channel_use(run: FlightLog) -> dict[str, Any] | None:
     kinds = np.minimum(run.outcome[slots], len(OUTCOMES) - 1)
     shares, middle = _sum_in_bins(run, slots, kinds, run.outcome_known[slots], len(OUTCOMES))
     (recorded,), _ = _sum_in_bins(run, slots, 0, 1, 1)
-    (lost,), _ = _sum_in_bins(run, frames.row, 0, frames.lost, 1)
-    (offered,), _ = _sum_in_bins(run, frames.row, 0, np.maximum(run.merged is None, run.known_receivers), 1)
+    rows = frames.row[run.sender_known]
+    (lost,), _ = _sum_in_bins(run, rows, 0, frames.lost[run.sender_known], 1)
+    (offered,), _ = _sum_in_bins(run, rows, 0, run.known_receivers[run.sender_known], 1)
     return {
         "time": thin(middle),
         "share": {name: thin(row / np.maximum(1, recorded)) for name, row in zip(OUTCOMES, shares, strict=True)},
@@ -208,20 +209,23 @@ def _agent_row(run: FlightLog, ages: MeanAges | None, agent: int) -> dict[str, A
     """The row of an agent in the table."""
     frames, is_merged = run.sent_frames, run.merged is not None
     own = frames.sender == agent
-    offered = int(run.known_receivers[own].sum())
-    heard = round(float(frames.received[own].sum()) / max(1, offered), 4)
+    known = own & run.sender_known
+    receivers = run.receivers[known]
+    heard = round(float((frames.received[known] & receivers).sum()) / max(1, int(receivers.sum())), 4)
     row: dict[str, Any] = {
         "id": agent,
         "moving": bool(run.scenario.moving[agent - 1]) if run.scenario else None,
         "sent": int(own.sum()),
-        "heard": heard if own.any() and (offered or not is_merged) else None,
+        "heard": heard if receivers.any() else None,
         "collided": None if is_merged else int((frames.collided[own] > 0).sum()),
     }
     for name, digits in (("age", 2), ("error", 4)) if ages else ():
-        values = getattr(ages, name)
-        known = values[np.isfinite(values[:, agent - 1]) & ages.results, agent - 1]
-        row[f"{name}_mean"] = round(float(known.mean()), digits) if len(known) else None
-        row[f"{name}_max"] = round(float(known.max()), digits) if len(known) else None
+        values, observers = getattr(ages, name)[:, agent - 1], ages.observers[:, agent - 1]
+        known = np.isfinite(values) & ages.results
+        values, observers = values[known], observers[known]
+        mean = float(values @ observers) / max(1, int(observers.sum()))  # over pairs, as in the results
+        row[f"{name}_mean"] = round(mean, digits) if len(values) else None
+        row[f"{name}_max"] = round(float(values.max()), digits) if len(values) else None
     track = run.path[:, :, agent - 1]
     track = track[np.isfinite(track).all(axis=1)]
     if len(run.path) > 1 and len(track):

@@ -60,7 +60,7 @@ class Follower:
         self._builder = MomentBuilder(self._history, run, self.scenario, self._more)
         self._position = np.array(self.scenario.start)  # (3, N) m
         self._chosen = np.zeros(self.agents, np.uint16)
-        self._digest = np.zeros(self.agents, np.uint32)
+        self._digest = np.zeros(0, np.uint32)  # of those that have reported the last slot
         self._reason = np.zeros(self.agents, np.uint8)
         self._slot = 0  # the slot that is under way
         self._next = 0  # first slot of the next moment
@@ -96,6 +96,7 @@ class Follower:
         slot, index, senders = int(record.slot), self._index(record.agent), np.asarray(record.sender).tolist()
         self._index(senders)
         mask = unpack_received(bytes(np.asarray(record.received, np.uint8)), len(senders), self.agents)
+        mask[:, [agent - 1 for agent in self._builder.absent]] = 0  # no frame reaches those that do not take part
         frames = split_frames(bytes(np.asarray(record.data, np.uint8)), np.asarray(record.length).tolist())
         received = [(slot, frame, row) for frame, row in zip(frames, mask, strict=True) if row.any()]
         position = self._position.copy()  # of agents that are lost: the last one
@@ -107,18 +108,18 @@ class Follower:
         self._position = position
         self._chosen[:], self._reason[:] = 0, 0
         self._chosen[index] = np.asarray(record.chosen, np.uint16)
-        self._digest[index] = np.asarray(record.digest, np.uint32)
+        self._digest = np.asarray(record.digest, np.uint32)
         self._reason[index] = np.asarray(record.reason, np.uint8)
+        self._detect_crashes(slot)
         if slot >= self._next:
             self._next = slot + self._builder.period
             self._builder.add_positions(slot, position)
-            self._detect_crashes(slot)
             self._add_moment(slot)
         if self._replay is not None:
             self._replay.delivery.add_slot(len(senders), mask)
             self._replay.step(slot, received)
         self._builder.add_frames(slot, int(record.outcome), senders, self._reason, mask.astype(bool))
-        self._builder.add_choices(self._chosen)
+        self._builder.add_choices(self._chosen[index])
         self._slot = slot + 1
 
     def _add_moment(self, slot: int) -> None:

@@ -167,16 +167,15 @@ class MomentBuilder:
 
         :param outcome: as in dtsa_msgs/SlotRecord.
         :param reason: (N,) index into ``REASONS``: why each agent decided as it did.
-        :param received: (F, N) which agents received each frame; None: all others.
+        :param received: (F, N) which agents received each frame; None: not known.
         """
-        most = max(1, self.agents - 1)
         for row, sender in enumerate(senders):
-            share = 255 if received is None else min(255, round(255 * np.count_nonzero(received[row]) / most))
+            most = max(1, self.agents - len(self.absent | {sender}))
+            share = 255 if received is None else min(254, round(254 * np.count_nonzero(received[row]) / most))
             self._frames.append((slot, sender, outcome, reason.item(sender - 1), share))
 
     def add_choices(self, chosen: NDArray[Any]) -> None:
-        """Add the senders (ids) that the agents choose for a slot; of those that take part it counts."""
-        chosen = self._present(chosen)
+        """Add the senders (ids) that agents choose for a slot, those that have reported it."""
         if len(chosen):
             self._compared += 1
             self._same += bool((chosen == chosen[0]).all())
@@ -211,7 +210,7 @@ class MomentBuilder:
         :param slot: the slot that starts.
         :param tables: one table an agent, with the estimates for this time; None: not known.
         :param chosen: (N,) ids of the senders that the agents choose.
-        :param digest: (N,) digests of their tables; None: not known.
+        :param digest: digests of the tables of those that have reported; None: not known.
         :param more: further values for the page.
         """
         while self._scheduled and self._scheduled[0].slot <= slot:
@@ -224,7 +223,7 @@ class MomentBuilder:
             "at": pack(np.array([at for at, _ in self._positions], "<u4")),
             "place": pack(np.array([position for _, position in self._positions], "<f4")),
             "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(_FRAME)},
-            "tables": 0 if digest is None else len(set(self._present(digest).tolist())),
+            "tables": 0 if digest is None else len(set(digest.tolist())),
             "chosen": pack(chosen.astype("<u2")),
             "age": pack(self._mean_ages(slot, tables)),
             "agree": [self._compared, self._same],
@@ -241,18 +240,20 @@ class MomentBuilder:
         self._compared = self._same = 0
         self._history.append(Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed))
 
-    def _present(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Those of values by agent that are of agents which take part."""
-        return np.delete(values, [agent - 1 for agent in self.absent])
-
     def _mean_ages(self, slot: int, tables: Swarm | None) -> NDArray[np.uint16]:
-        """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move."""
+        """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move.
+
+        Agents that do not take part are left out, as movers and as those that heard.
+        """
         ages = np.full(self.agents, UNKNOWN, np.uint16)
         if tables is None:
             return ages
         counted = (tables.in_ap != 0) & (tables.sent_slot >= 0) & self._moving
+        absent = np.array(sorted(self.absent), np.intp) - 1
+        counted[:, absent] = False
         if len(counted) == self.agents:
             np.fill_diagonal(counted, False)
+            counted[absent] = False  # what they heard last does not grow old
         observers = counted.sum(axis=0)
         some = observers > 0
         old = np.where(counted, slot - 1 - tables.sent_slot, 0).sum(axis=0)
