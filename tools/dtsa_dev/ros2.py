@@ -51,8 +51,8 @@ def main(words: list[str]) -> int:
                 return on_graph(words)
             case _:
                 return refuse()
-    except (LookupError, ValueError, OSError, ImportError) as error:
-        print(f"ros2: error: {error}", file=sys.stderr)
+    except (LookupError, ValueError, OSError, ImportError, yaml.MarkedYAMLError) as error:
+        print(f"ros2: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
@@ -75,8 +75,11 @@ def definition(name: str) -> Path:
 
 def class_of(name: str) -> Any:
     """Class of an interface, `package/msg/Name`."""
-    package, kind, short = name.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), short)
+    try:
+        package, kind, short = name.split("/")
+        return getattr(importlib.import_module(f"{package}.{kind}"), short)
+    except (ValueError, ImportError, AttributeError):
+        raise LookupError(f"interface: got {name!r}; allowed: one that is installed, as std_msgs/msg/String") from None
 
 
 def on_graph(words: list[str]) -> int:
@@ -96,7 +99,7 @@ def on_graph(words: list[str]) -> int:
                 print("\n".join(name for name, _ in node.get_topic_names_and_types()))
             case ["service", "list"]:
                 print("\n".join(name for name, _ in node.get_service_names_and_types()))
-            case ["topic", "echo", topic, *once]:
+            case ["topic", "echo", topic, *once] if once in ([], ["--once"]):
                 listen(node, topic, lambda message, _: print(as_yaml(message), "---", sep="", flush=True), bool(once))
             case ["topic", "hz", topic]:
                 listen(node, topic, lambda _, rate: print(f"average rate: {rate:.3f}", flush=True) if rate else None)
@@ -109,12 +112,16 @@ def on_graph(words: list[str]) -> int:
                 answer = call(
                     node, f"{name}/get_parameters", "rcl_interfaces/srv/GetParameters", {"names": [parameter]}
                 )
+                if not answer.values or not answer.values[0].type:
+                    raise LookupError(f"param: got {parameter!r}; {name} has no such parameter")
                 print(parameter_value_to_python(answer.values[0]))
             case ["param", "set", name, parameter, value]:
                 one = class_of("rcl_interfaces/msg/Parameter")(name=parameter, value=get_parameter_value(value))
                 request = {"parameters": [one]}
-                answer = call(node, f"{name}/set_parameters", "rcl_interfaces/srv/SetParameters", request)
-                print("done" if answer.results[0].successful else f"refused: {answer.results[0].reason}")
+                answer = call(node, f"{name}/set_parameters", "rcl_interfaces/srv/SetParameters", request).results[0]
+                if not answer.successful:
+                    raise ValueError(f"param {parameter}: got {value!r}; refused: {answer.reason}")
+                print("done")
             case _:
                 return refuse()
     finally:
@@ -151,13 +158,19 @@ def listen(node: Any, topic: str, receive: Callable[[Any, float], None], once: b
 
 
 def call(node: Any, service: str, kind: str, fields: dict[str, Any]) -> Any:
-    """Answer of a service."""
+    """Answer of a service.
+
+    :raises ValueError: for a field that the request does not have, or a value that a field does not take.
+    """
     import rclpy
 
     client = node.create_client(class_of(kind), service)
     if not client.wait_for_service(ANSWER_S):
         raise LookupError(f"service: got {service!r}; no node offers it")
-    future = client.call_async(fill(class_of(kind).Request(), fields))
+    try:
+        future = client.call_async(fill(class_of(kind).Request(), fields))
+    except (AttributeError, AssertionError, TypeError) as error:
+        raise ValueError(f"request: {error}") from None
     rclpy.spin_until_future_complete(node, future, timeout_sec=ANSWER_S)
     if not future.done():
         raise LookupError(f"service {service}: no answer within {ANSWER_S:.0f} s")
@@ -177,6 +190,8 @@ def as_yaml(message: Any) -> str:
     def plain(value: Any) -> Any:
         if hasattr(value, "get_fields_and_field_types"):
             return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+        if hasattr(value, "tolist"):  # numbers of NumPy, and arrays of numbers
+            return value.tolist()
         return value if isinstance(value, bytes | str | int | float) else [plain(each) for each in value]
 
     return yaml.safe_dump(plain(message), sort_keys=False)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 pytest.importorskip("rclpy")
 
@@ -18,12 +19,14 @@ from dtsa_bench.flights.domain import ros_domain
 
 TALKER = """
 import rclpy
+from nav_msgs.msg import Odometry
 from std_msgs.msg import String
 rclpy.init()
 node = rclpy.create_node("talker")
 node.declare_parameter("speed", 2)
 publisher = node.create_publisher(String, "words", 10)
-node.create_timer(0.05, lambda: publisher.publish(String(data="hello")))
+place = node.create_publisher(Odometry, "place", 10)
+node.create_timer(0.05, lambda: (publisher.publish(String(data="hello")), place.publish(Odometry())))
 print("ready", flush=True)
 rclpy.spin(node)
 """
@@ -66,6 +69,9 @@ def test_the_graph(ros2: Ros2) -> None:
     rate = float(ros2("topic", "hz", "/words", lines=1)[1].removeprefix("average rate: "))
     assert 1 < rate < 40
     assert ros2("topic", "echo", "/nothing")[0] == 2
+    code, text = ros2("topic", "echo", "/place", "--once")
+    assert code == 0
+    assert yaml.safe_load(text.removesuffix("---\n"))["pose"]["covariance"] == [0.0] * 36
 
 
 @pytest.mark.ros
@@ -75,6 +81,21 @@ def test_parameters_and_services(ros2: Ros2) -> None:
     assert ros2("param", "get", "/talker", "speed") == (0, "3\n")
     kind = "rcl_interfaces/srv/GetParameters"
     assert "integer_value: 3\n" in ros2("service", "call", "/talker/get_parameters", kind, "{names: [speed]}")[1]
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("words", [
+    ("param", "get", "/talker", "nothing"), ("param", "set", "/talker", "speed", "fast"),
+    *(("service", "call", "/talker/get_parameters", "rcl_interfaces/srv/GetParameters", text)
+      for text in ("{names: [speed", "{nothing: 1}", "{names: 5}", "5")),
+    ("service", "call", "/talker/get_parameters", "rcl_interfaces/srv/Nothing"),
+    ("service", "call", "/talker/get_parameters", "nothing"),
+    ("topic", "echo", "/words", "--nothing"),
+])  # fmt: skip
+def test_what_is_refused_is_an_error(words: tuple[str, ...], ros2: Ros2) -> None:
+    code, text = ros2(*words)
+    assert code == 2
+    assert "Traceback" not in text
 
 
 def test_nodes_and_interfaces(ros2: Ros2, tmp_path: Path) -> None:
