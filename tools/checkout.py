@@ -109,7 +109,8 @@ def run_command(name: str, *rest: str) -> int:
             for path in (ROOT / each for each in ("build", "install", "log")):
                 shutil.rmtree(path, ignore_errors=True)
             for path in ROOT.glob(".venv*") if rest else ():
-                discard(path)
+                if (path / "dtsa.json").exists() or path.suffix in (".new", ".old"):  # others' are left alone
+                    discard(path)
     elif name == "test":
         prepare(set(EXTRAS))
         os.chdir(ROOT)
@@ -135,7 +136,7 @@ def start(*words: str) -> None:
         "PYTHONSAFEPATH": "1",  # what lies in the current folder is no module
         "VIRTUAL_ENV": str(VENV),
     }
-    sys.stdout.flush()
+    print(end="", flush=True)
     os.execvp(words[0], words)
 
 
@@ -157,7 +158,7 @@ def prepare(extras: set[str]) -> None:
             shutil.rmtree(place, ignore_errors=True)
             base = getattr(sys, "_base_executable", sys.executable)
             run("environment", f"{VENV.name}, Python {VERSION}", [uv, "venv", "--relocatable", "-p", base, place])
-        note(place, extras)
+        note(place, set(done.get("extras", ())))  # what cannot be installed is not asked for again
         options = ["--group=build", *(["--group=ros"] if HAS_ROS else []), "-p", python]
         options += ["--group=dev" if name == "dev" else f"--extra={name}" for name in sorted(extras)]
         words = [uv, "pip", "install", "--require-hashes", "-r", "pyproject.toml", "-c", "requirements.txt", *options]
@@ -168,14 +169,15 @@ def prepare(extras: set[str]) -> None:
         if place != VENV:
             discard(VENV)
             place.rename(VENV)
+        steps: list[list[str | Path]] = []
         if HAS_ROS:
             messages = cached(f"messages-{keys()[1]}-{site_packages().parent.name}", build_messages)
             # Files that a process may use are replaced, not written into.
-            subprocess.run(["cp", "-r", "--remove-destination", f"{messages}/.", VENV], check=True)
+            steps = [["cp", "-r", "--remove-destination", f"{messages}/.", VENV]]
         for path in compiled():
             path.unlink()
         words = [uv, "pip", "install", "--no-deps", "--no-build-isolation", "--offline", "--reinstall", "-e", ROOT]
-        run("package", "compiled modules, commands", [*words, "-p", VENV / "bin/python"])
+        run("package", "compiled modules, commands", *steps, [*words, "-p", VENV / "bin/python"])
         paths = [ROOT / "tools", *(ROOT / "src" / name for name in ("dtsa_agent", "dtsa_channel_sim", "dtsa_bench"))]
         (site_packages() / "dtsa_checkout.pth").write_text("\n".join(map(str, paths)) + "\n", encoding="utf-8")
         note(VENV, extras, whole=True, key=keys()[0])
@@ -314,13 +316,14 @@ def cached(name: str, make: Callable[[Path], None]) -> Path:
 
 def writable(variable: str, default: str) -> Path:
     """Folder that a variable of the environment names; a temporary one, said once, where it cannot be made."""
-    path = Path(os.environ.get(variable) or default).expanduser()
     try:
+        path = Path(os.environ.get(variable) or default).expanduser()
         path.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=path).close()
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # RuntimeError: a user without a home
         path = Path(tempfile.mkdtemp(prefix="dtsa-"))
-        print(f"dtsa: {error.filename}: {error.strerror}; {variable} is {path} instead", file=sys.stderr)
+        reason = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else error
+        print(f"dtsa: {reason}; {variable} is {path} instead", file=sys.stderr)
         os.environ[variable] = str(path)
     return path
 
@@ -369,6 +372,8 @@ def run(name: str, title: str, *commands: Sequence[str | Path], environment: Map
                     process.wait()
             if process.returncode:
                 show("failed")
-                reason = next(filter(ERROR.search, lines()), lines()[-1]).strip()[:300]
+                found = [line for line in lines() if ERROR.search(line) and not line.lower().startswith("warning")]
+                # What the system refused, as a full disk, comes last in uv's chain of causes.
+                reason = min(found, key=lambda line: "(os error" not in line, default=lines()[-1]).strip()[-300:]
                 raise SetupError(f"step '{name}' failed: {reason}; log: {path}", code=1)
     show(f"{time.monotonic() - began:.0f} s")

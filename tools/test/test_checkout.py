@@ -123,6 +123,8 @@ def test_the_environment_of_others_is_left_alone_and_another_python_has_its_own(
     assert result.returncode == 2
     assert ".venv was not made by tools/dtsa" in result.stderr
     assert result.stderr.count("\n") == 1
+    assert call("clean", "--all", tool=empty / "tools/dtsa").returncode == 0
+    assert (empty / ".venv/bin/python").is_symlink()
     program = "import checkout; print(checkout.VENV.name)"
     environment = {**os.environ, "PYTHONPATH": str(DTSA.parent), "DTSA_PYTHON": sys.executable}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
@@ -145,9 +147,13 @@ def test_what_is_made_again_when_a_file_changes(empty: Path) -> None:
     assert checkout.keys()[1] != messages
 
 
-def test_a_failed_step_is_named_with_its_reason_and_log(empty: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with checkout.lock(), pytest.raises(checkout.SetupError, match=r"'build' failed: fatal: full; log: .*build\.log"):
-        checkout.run("build", "all", ["sh", "-c", "echo compiling; echo fatal: full; exit 3"])
+@pytest.mark.parametrize(("lines", "reason"), [
+    (("compiling", "fatal: full"), "fatal: full"), (("warning: failed to link", "fatal: full"), "fatal: full"),
+    (("error: failed to install", "cause: No space left on device (os error 28)"), "cause: No space .*28.*"),
+])  # fmt: skip
+def test_a_failed_step_is_named_with_its_reason_and_log(lines, reason, empty, capsys):
+    with checkout.lock(), pytest.raises(checkout.SetupError, match=rf"'build' failed: {reason}; log: .*build\.log"):
+        checkout.run("build", "all", ["sh", "-c", 'printf "%s\n" "$@"; exit 3', "sh", *lines])
     assert capsys.readouterr().err == "dtsa: all ...\ndtsa: all ... failed\n"
 
 
@@ -200,6 +206,8 @@ def test_a_folder_that_cannot_be_made_is_replaced(monkeypatch: pytest.MonkeyPatc
     assert [os.access(path, os.W_OK) for path in result.stdout.split()] == [True, True]
     assert result.stderr.count("\n") == 2
     assert "ROS_LOG_DIR is" in result.stderr
+    result = call("shell", "-c", "echo $ROS_LOG_DIR", ROS_LOG_DIR="~nobody.of.that.name/log")
+    assert (result.returncode, os.access(result.stdout.strip(), os.W_OK)) == (0, True)
 
 
 @pytest.fixture
@@ -246,3 +254,17 @@ def test_a_set_up_that_is_interrupted_at_any_moment_is_finished_by_the_same_comm
     assert flight.returncode == 0, flight.stderr
     nodes = call("ros2", "pkg", "executables", tool=command[0], **more).stdout
     assert "dtsa_agent agent\n" in nodes
+    # What cannot be installed is not asked for again, and what cannot be copied is a line.
+    offline = {**more, "UV_OFFLINE": "1"}
+    wanted = call("setup", "--extra", "learning", tool=command[0], **{**offline, "UV_CACHE_DIR": str(tmp_path / "no")})
+    assert (wanted.returncode, "step 'packages' failed" in wanted.stderr) == (1, True)
+    result = call("shell", "-c", "python -c 'import pettingzoo'", tool=command[0], **offline)
+    assert "ModuleNotFoundError" in result.stderr
+    backend = place / "tools/package/backend.py"
+    backend.write_text(f"{backend.read_text()}# changed\n")
+    messages = next((tmp_path / "cache/dtsa").glob("messages-*"))
+    messages.rename(tmp_path / "aside")
+    messages.touch()
+    result = call("setup", tool=command[0], **offline)
+    assert (result.returncode, "step 'package' failed" in result.stderr) == (1, True)
+    assert "Traceback" not in result.stderr
