@@ -63,7 +63,9 @@ The same as `pytest -m soak`. A test that fails is run again by `pytest --last-f
         words += ["--collect-only", "-q"] if args.list else ["-v"]
         files = SOAKS.values() if args.name is None else [SOAKS[args.name]]
         environment = {**os.environ, **({"DTSA_EVIDENCE": "1"} if args.evidence and not args.list else {})}
-        return subprocess.call([sys.executable, "-m", "pytest", *words, *map(str, files)], cwd=ROOT, env=environment)
+        os.chdir(ROOT)
+        # In place of this process, which at Ctrl-C would not wait until the tests have ended what they started.
+        os.execve(sys.executable, [sys.executable, "-m", "pytest", *words, *map(str, files)], environment)
 
 
 SITE = "runs/site"

@@ -268,3 +268,21 @@ def test_a_set_up_that_is_interrupted_at_any_moment_is_finished_by_the_same_comm
     result = call("setup", tool=command[0], **offline)
     assert (result.returncode, "step 'package' failed" in result.stderr) == (1, True)
     assert "Traceback" not in result.stderr
+
+
+def test_ctrl_c_in_a_soak_waits_for_the_tests_to_end_what_they_started(tmp_path: Path) -> None:
+    (tmp_path / "slow_end.py").write_text(
+        "import pathlib, sys, time\n"
+        "def pytest_sessionstart():\n    print('begun', flush=True)\n    time.sleep(60)\n"
+        f"def pytest_unconfigure():\n    time.sleep(1)\n    pathlib.Path({str(tmp_path / 'ended')!r}).touch()\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTEST_ADDOPTS": "-s -p slow_end"}
+    with subprocess.Popen(
+        [sys.executable, "-m", "dtsa_dev", "soak", "statements"],
+        env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, start_new_session=True,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        assert any(line == "begun\n" for line in process.stdout)
+        os.killpg(process.pid, signal.SIGINT)
+        process.wait(60)
+    assert (tmp_path / "ended").exists()
