@@ -210,6 +210,13 @@ def test_a_folder_that_cannot_be_made_is_replaced(monkeypatch: pytest.MonkeyPatc
     assert (result.returncode, os.access(result.stdout.strip(), os.W_OK)) == (0, True)
 
 
+def test_a_command_whose_standard_output_is_closed_does_its_work(tmp_path: Path) -> None:
+    words = ["sh", "-c", '"$@" >&-', "sh", DTSA, "simulate", "--agents", "2", "--timeout-s", "1", "--out"]
+    result = subprocess.run([*words, tmp_path / "a"], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert (tmp_path / "a/summary.json").exists()
+
+
 @pytest.fixture
 def foreign(tmp_path: Path) -> Path:
     for name in ("numpy", "yaml", "dtsa_bench", "rclpy"):

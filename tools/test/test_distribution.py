@@ -23,7 +23,8 @@ import dtsa_bench
 from dtsa_agent.core.errors import ConfigError
 
 # ROS of the tests' environment must not be found from the fresh one.
-HIDDEN = "import sys\nfor name in ('rclpy', 'ament_index_python', 'dtsa_msgs'):\n    sys.modules[name] = None\n"
+ROS = ("rclpy", "ament_index_python", "diagnostic_msgs", "dtsa_msgs")
+HIDDEN = f"import sys\nfor name in {ROS}:\n    sys.modules[name] = None\n"
 DIGEST = "import release_trial; print(release_trial.digest())"
 
 
@@ -92,6 +93,11 @@ def test_works_without_a_workspace(installed: Path, tmp_path: Path) -> None:
     assert trial["digest"] == here.strip()
     where = run(installed / "python", "-c", "import dtsa; print(dtsa.__file__)", cwd=tmp_path).stdout
     assert where.startswith(str(installed.parent))
+    for words in (["demo"], ["relay", "relay.yaml"], ["replay", "a"], ["fly", "--out", "a"]):
+        error = run(installed / "dtsa", *words, cwd=tmp_path, code=2).stderr
+        assert "is missing: source an installation of ROS 2" in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "runs").exists()
     error = run(installed / "dtsa", "view", cwd=tmp_path, code=2).stderr
     assert error.startswith("dtsa: error: the Python package dtsa_msgs is missing: source an installation of ROS 2")
     assert error.count("\n") == 1

@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             return _run(list(sys.argv[1:] if arguments is None else arguments))
         finally:
-            sys.stdout.flush()  # now, so that an error of that can be told
+            print(end="", flush=True)  # now, so that an error of that can be told; nothing where it is closed
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:

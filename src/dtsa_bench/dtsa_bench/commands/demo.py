@@ -60,7 +60,6 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
     number = 1
     while args.out is None and Path(f"runs/demo-{number}").exists():
         number += 1
-    directory = new_directory(args.out or f"runs/demo-{number}")
 
     from dtsa_bench.flights.domain import clear_hindrances
 
@@ -70,6 +69,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
     from dtsa_bench.pages.demo.flights import HEAD, demo_steps, fly_all, table_rows
     from dtsa_bench.pages.report.data import write_report
 
+    directory = new_directory(args.out or f"runs/demo-{number}")
     begin = time.monotonic()
     steps = demo_steps(seed)
     print(f"{sum(map(len, steps))} flights of ROS 2 nodes, recorded to {directory}", flush=True)

@@ -104,16 +104,18 @@ def hint(word: str, words: Iterable[str]) -> str:
 
 _WORKSPACE = "build the workspace and source it: colcon build && . install/setup.bash"
 _ROS = "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout on x86_64"
+_ROS_PACKAGES = (
+    "rclpy", "ament_index_python", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "nav_msgs",
+    "rcl_interfaces", "rosgraph_msgs", "std_msgs", "std_srvs", "visualization_msgs",
+)  # fmt: skip
 _HOW = {
     **dict.fromkeys(("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim"), _WORKSPACE),
     **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard", "pyarrow", "pandas", "aiohttp", "shtab"), "pip install {}"),
     **dict.fromkeys(("cflib", "distributed"), "pip install {}"),
-    **dict.fromkeys(
-        ("rclpy", "ament_index_python", "builtin_interfaces", "geometry_msgs", "nav_msgs", "std_msgs"), _ROS
-    ),
+    **dict.fromkeys(_ROS_PACKAGES, _ROS),
     **dict.fromkeys(("serial", "cobs"), "pip install pyserial cobs"),
     "yaml": "apt install python3-yaml, or pip install pyyaml",
-    **dict.fromkeys(("numpy", "scipy", "matplotlib", "rich"), "apt install python3-{0}, or pip install {0}"),
+    **dict.fromkeys(("numpy", "scipy", "matplotlib", "rich", "jinja2"), "apt install python3-{0}, or pip install {0}"),
 }
 
 
