@@ -39,8 +39,9 @@ files, release.json and release.log are then in DIR. Nothing is uploaded."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--out", metavar="DIR", required=True, help="new directory for the files")
-        text = f"do without, where the machine lacks it: {', '.join((*PYTHONS, AARCH64))}; more than once"
-        parser.add_argument("--skip", metavar="NAME", action="append", default=[], help=text)
+        names = (*PYTHONS, AARCH64)
+        text = f"do without, where the machine lacks it: {', '.join(names)}; more than once"
+        parser.add_argument("--skip", metavar="NAME", action="append", default=[], choices=names, help=text)
 
     def run(self, args: argparse.Namespace) -> int:
         """Make and try everything.
