@@ -6,7 +6,6 @@ import importlib
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -89,8 +88,9 @@ def on_graph(words: list[str]) -> int:
 
     rclpy.init(args=[])
     node = rclpy.create_node(f"ros2_{time.time_ns()}", start_parameter_services=False)
-    time.sleep(DISCOVERY_S)
     try:
+        if words[1:] == ["list"]:
+            discover(node)
         match words:
             case ["node", "list"]:
                 names = {f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces()}
@@ -124,16 +124,29 @@ def on_graph(words: list[str]) -> int:
                 print("done")
             case _:
                 return refuse()
+    except Exception:
+        if rclpy.ok():
+            raise
+        return 130  # a signal has ended the context
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
     return 0
 
 
+def discover(node: Any) -> None:
+    """Wait until the graph has others in it and stays as it is for a while, at most as long as for an answer."""
+    found, since, deadline = [], time.monotonic(), time.monotonic() + ANSWER_S
+    while (now := time.monotonic()) < min(since + DISCOVERY_S, deadline):
+        names = [*node.get_node_names_and_namespaces(), *node.get_topic_names_and_types()]
+        if names != found or len(node.get_node_names()) == 1:
+            found, since = names, now
+        time.sleep(0.1)
+
+
 def listen(node: Any, topic: str, receive: Callable[[Any, float], None], once: bool = False) -> None:
     """Give the messages on a topic to a function, with their rate each second, else 0."""
     import rclpy
-    from rclpy.executors import ExternalShutdownException
     from rclpy.qos import QoSProfile
 
     deadline = time.monotonic() + ANSWER_S
@@ -152,9 +165,8 @@ def listen(node: Any, topic: str, receive: Callable[[Any, float], None], once: b
     theirs = publishers[0].qos_profile
     profile = QoSProfile(depth=10, reliability=theirs.reliability, durability=theirs.durability)
     node.create_subscription(class_of(publishers[0].topic_type), topic, on_message, profile)
-    with suppress(ExternalShutdownException):
-        while not (once and times):
-            rclpy.spin_once(node)
+    while not (once and times):
+        rclpy.spin_once(node)
 
 
 def call(node: Any, service: str, kind: str, fields: dict[str, Any]) -> Any:
