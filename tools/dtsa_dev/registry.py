@@ -9,7 +9,6 @@ import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from dtsa_bench.commands.registry import Command
@@ -30,14 +29,6 @@ def add_commands() -> None:
     from dtsa_bench.commands import registry
 
     registry.add_commands(COMMANDS, {name: f"dtsa_dev.{_MODULES.get(name, name)}" for name in COMMANDS})
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command, of `dtsa_bench` or of a checkout; see :func:`dtsa_bench.commands.cli.main`."""
-    add_commands()
-    from dtsa_bench.commands.cli import main as run
-
-    return run(arguments)
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -96,13 +87,12 @@ that the navigation does not name end the build with code 1."""
             raise ConfigError("out", args.out, "a new or empty directory, or one with a site, which is replaced")
         if not 1 <= args.port <= 65535:
             raise ConfigError("port", args.port, "1 to 65535")
-        root = Path(__file__).resolve().parents[2]
         how = (
             ["serve", "--dev-addr", f"{HOST}:{args.port}"]
             if args.serve
             else ["build", "--quiet", "--site-dir", str(out)]
         )
-        command = [sys.executable, "-m", "mkdocs", *how, "--strict", "--config-file", str(root / "mkdocs.yml")]
+        command = [sys.executable, "-m", "mkdocs", *how, "--strict", "--config-file", str(ROOT / "mkdocs.yml")]
         # Material's announcement of its successor is no warning about a page.
         code = subprocess.call(command, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"})
         if code == 0 and not args.serve:

@@ -29,6 +29,8 @@ def main(words: list[str]) -> int:
     nodes = {tuple(point.name.split(".", 1)): point for point in entry_points(group="dtsa.nodes")}
     try:
         match words:
+            case ["-h" | "--help"]:
+                print(USAGE)
             case ["run", package, executable, *rest] if (package, executable) in nodes:
                 sys.argv = [executable, *rest]
                 return int(nodes[package, executable].load()() or 0)

@@ -6,7 +6,11 @@ import json
 
 import pytest
 from dtsa_dev.benchmark import core
-from dtsa_dev.registry import main
+from dtsa_dev.registry import add_commands
+
+from dtsa_bench.commands.cli import main
+
+add_commands()
 
 
 def test_kernels_slots_and_flights_are_rows_of_a_record(tmp_path, capsys, monkeypatch):

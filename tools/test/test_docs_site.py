@@ -16,11 +16,13 @@ import pytest
 pytest.importorskip("mkdocs")
 
 from browser_helpers import CHROMIUM, MISSING, browsing
-from dtsa_dev.registry import main
+from dtsa_dev.registry import add_commands
 
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import settings_of
+from dtsa_bench.commands.cli import main
 
+add_commands()
 ROOT = Path(__file__).resolve().parents[2]
 _LINK = re.compile(r'<a [^>]*?href="([^"#]*)')
 _LOADED = re.compile(r'<(?:script|img|iframe)[^>]*? src="([^"]+)"|<link [^>]*?href="([^"]+)"')

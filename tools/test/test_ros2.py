@@ -100,6 +100,7 @@ def test_what_is_refused_is_an_error(words: tuple[str, ...], ros2: Ros2) -> None
 
 
 def test_nodes_and_interfaces(ros2: Ros2, tmp_path: Path) -> None:
+    assert ros2("--help")[0] == 0
     assert "dtsa_agent agent\n" in ros2("pkg", "executables")[1]
     assert "uint32 run " in ros2("interface", "show", "dtsa_msgs/msg/Slot")[1]
     code, text = ros2("run", "dtsa_bench", "dtsa", "--version")
