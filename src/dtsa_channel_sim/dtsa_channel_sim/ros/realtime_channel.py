@@ -158,6 +158,9 @@ class RealtimeChannel(RosChannel):
 
     def _hear(self, agents: Sequence[int], now: int) -> None:
         index = np.array(agents, dtype=np.intp) - 1
+        silence_ns = now - self._heard_ns.max()
+        if silence_ns > self._patience_ns:  # of all: it counts for no agent
+            self._heard_ns += silence_ns
         self._heard_ns[index] = np.maximum(self._heard_ns[index], now)
 
     def last_place(self, agent: int) -> NDArray[np.float64]:
