@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped
@@ -27,7 +29,10 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
 from dtsa_agent.ros.common.checks import BadMessage
-from dtsa_channel_sim.relay.node import TransformTree
+from dtsa_agent.stop import Stop, StopToken
+from dtsa_channel_sim.relay.node import Relay, TransformTree
+from dtsa_channel_sim.relay.settings import RelaySettings
+from dtsa_channel_sim.relay.transport import RadioMessage
 
 pytestmark = pytest.mark.ros
 MODULE = "dtsa_channel_sim.relay.node"
@@ -154,6 +159,32 @@ def test_losses_are_those_of_the_seed_on_an_idle_and_a_busy_machine(graph: Graph
         assert max(collided_idle[pair], collided_busy[pair]) <= (5 if access == "lease" else 0)
     assert all(50 < len(came) < 90 for came in idle.values())
     assert len({frozenset(came) for came in idle.values()}) == len(idle)
+
+
+def test_no_message_is_lost_that_comes_while_many_are_read(graph: Graph) -> None:
+    """As many wait as can, and one more comes when the first is read."""
+    node = rclpy.create_node("relay", context=graph.node.context)
+    relayed = Relay(node, RelaySettings.from_dict({"robots": TWO}))
+    publisher = graph.node.create_publisher(String, "/robot1/text", 200)
+    give = relayed._transport.send
+
+    def send(message: RadioMessage) -> None:
+        if message.number == 1:
+            publisher.publish(String(data="more"))
+            time.sleep(0.3)
+        give(message)
+
+    relayed._transport.send = send  # type: ignore[method-assign]
+    graph.until(lambda: node.get_publishers_info_by_topic("/robot1/text"))
+    relayed._tick(1)
+    graph.until(lambda: publisher.get_subscription_count())
+    for number in range(100):
+        publisher.publish(String(data=str(number)))
+    time.sleep(0.3)  # they come
+    end_s = time.monotonic() + 2.0
+    relayed.run(StopToken(Stop(), lambda: "time" * (time.monotonic() > end_s)))
+    node.destroy_node()
+    assert relayed._transport.counts["sent"][0, 1] == 101
 
 
 def test_quality_of_service_is_the_publishers_and_a_latched_message_reaches_all(graph: Graph, tmp_path: Path) -> None:
@@ -337,6 +368,23 @@ def test_what_is_wrong_is_named_and_nothing_ends(graph: Graph, tmp_path: Path) -
         assert output.count(line) == 1, output
     assert "Traceback" not in output
     del wrong, later
+
+
+def test_odometry_that_is_none_is_named_and_the_rest_goes_on(graph: Graph, tmp_path: Path) -> None:
+    topics = {"odom": {}, **TWO["robot1"]["topics"]}
+    odometry = graph.node.create_publisher(PoseStamped, "/robot1/odom", 1)
+    pair = Pair(graph)
+    robots = {"robot1": {"odometry": "odom", "topics": topics}, "robot2": {}}
+    process = relay(graph, tmp_path / "relay.yaml", {}, robots)
+    pair.connect()
+    pair.send(0, 3)
+    graph.until(lambda: len(pair.texts) == 3)
+    process.send_signal(signal.SIGTERM)
+    output = process.communicate(timeout=60)[1]
+    assert process.returncode == 0
+    assert output.count("/robot1/odom: type: got 'geometry_msgs/msg/PoseStamped'") == 1
+    assert "Traceback" not in output
+    del odometry
 
 
 @pytest.mark.parametrize(

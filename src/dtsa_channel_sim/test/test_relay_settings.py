@@ -43,6 +43,7 @@ def test_a_file_says_all() -> None:
         ({"robots": {"a": {}, "/a": {}}}, "robots"),
         ({"robots": {"a": {"topics": {"x": {}}}}}, "channel.robots"),
         ({"robots": {"a": {"topics": {"/x": {}}}, "b": {"topics": {"/x": {}}}}}, "robots.b.topics./x"),
+        (content(topics={"map": {}, "/map": {}}), "robots.robot1.topics./map"),
         (content() | {"robot": 1}, "robot"),
         (content() | {"map_frame": 3}, "map_frame"),
         (content({"los": 0.1}), "channel.los"),

@@ -167,6 +167,18 @@ def test_without_limits_a_burst_arrives_whole() -> None:
     assert len(outcome(carrier.advance(10 * MS))) == 50
 
 
+@pytest.mark.parametrize("access", ["age", "error"])
+def test_equal_agents_have_equal_shares_of_an_air_that_is_too_slow(access: str) -> None:
+    """Three that stand still and have more to send than slots."""
+    carrier, places = transport(3, access=access, slot_ms=10), np.zeros((3, 3))
+    for number in range(500):
+        carrier.advance(20 * number * MS, places)
+        for sender in (1, 2, 3):
+            carrier.send(message(carrier, sender, number, 20 * number * MS))
+    received = carrier.counts["received"].sum(axis=1)
+    assert received.max() <= received.min() + 4
+
+
 def test_slots_of_silent_agents_are_used_under_lease_only() -> None:
     delay = {}
     for access in ("tdma", "lease"):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.core.delays import Delays
-from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.delivery import DeliveryCounts
 from dtsa_bench.runs.metrics import FlightMetrics, metrics_tables
 from dtsa_channel_sim.model.verdict import Verdict
@@ -20,6 +20,7 @@ from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 _MAX_PATH_BYTES = 1 << 24
+_REPORTS_S, _REPORT_SLOTS = 0.5, 3  # a slot in real time counts once it is reported: together so late at most
 _LAG = 0.25  # of a slot: who hears of a frame later than this decides without it now and then
 _LATE = 0.005  # share of frames, or of entries of reports
 _ON_TIME = 0.95
@@ -68,7 +69,8 @@ class FlightMeasurement(ChannelObserver):
         self.positions = FlightPath(run.swarm.agents)
         self.begin_s = self.end_s = 0.0  # wall clock: slot 0 answered by all, flight over; 0: not yet
         self.tables = metrics_tables(run, scenario, everyone=True)  # what each agent knows by what it has received
-        self._agents = run.swarm.agents
+        self._agents, self._slot_s = run.swarm.agents, run.swarm.slot_s
+        self._reports_s = 0.0 if run.mode == LOCKSTEP else _REPORTS_S + _REPORT_SLOTS * self._slot_s
         self._oracle = run.swarm.estimator_row.needs_everybody
         self._outcome = 0
         self._lengths: list[int] = []  # of the frames of the slot that is being flown
@@ -76,8 +78,9 @@ class FlightMeasurement(ChannelObserver):
 
     @property
     def wall_time_s(self) -> float:
-        """Wall-clock time of the flight so far, s."""
-        return max(0.0, (self.end_s or time.monotonic()) - self.begin_s) if self.begin_s else 0.0
+        """Wall-clock time of the flight so far, s; without the wait for its last reports."""
+        passed_s = max(0.0, (self.end_s or time.monotonic()) - self.begin_s) if self.begin_s else 0.0
+        return max(min(passed_s, self.metrics.slots * self._slot_s), passed_s - self._reports_s)
 
     def start_known(self, at_s: float) -> None:
         self.begin_s = at_s

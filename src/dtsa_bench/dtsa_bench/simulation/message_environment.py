@@ -129,7 +129,8 @@ class MessageEnv(BaseParallelWrapper):  # type: ignore[misc]
         for sender, name in enumerate(names, 1):
             if name in sent and present[sender - 1]:
                 self._transport.send(RadioMessage(sender, "", step, self._size, now_ns, present, sent[name]))
-        self._transport.advance(now_ns + self._step_ns, self._places())
+        # A slot that begins with the next step is that step's: its messages come first.
+        self._transport.advance(now_ns + self._step_ns - 1, self._places())
         observations, infos = dict(observations), dict(infos)
         for name, newest in zip(names, self._transport.newest, strict=True):
             received = {other: message for other, message in zip(names, newest, strict=True) if other != name}

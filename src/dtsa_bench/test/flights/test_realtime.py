@@ -48,7 +48,7 @@ def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path:
     more = ("--no-align", "--clock-offset-ns", "4000000", "--clock-jitter-ns", "20000", "--timeout-s", "1")
     summary = fly(tmp_path / "fast", *words, *more, "--no-picture")
     assert (summary["mode"], summary["end"], summary["lost_agents"]) == ("realtime", "timed out", [])
-    assert summary["realtime_factor"] == pytest.approx(1.0, abs=0.2)
+    assert summary["realtime_factor"] == pytest.approx(1.0, abs=0.02)  # without the wait for its last reports
     log = load_log(tmp_path / "fast")
     assert len(set(log.offset_ns[0])) == 3  # three clocks, none like another
     assert (log.offset_ns[log.sent] < 0).any()

@@ -87,6 +87,23 @@ def test_a_channel_that_stood_still_shows_in_what_the_agents_knew_and_makes_nobo
 
 
 @pytest.mark.ros
+@pytest.mark.alone
+@pytest.mark.realtime
+def test_agents_that_stood_still_together_are_not_lost_and_what_they_report_counts(tmp_path: Path) -> None:
+    words = ("--policy", "tdma", "--agents", "12", "--processes", "4", "--slot-ms", "20", "--scenario", "waypoints")
+    with started(tmp_path, *words, "--stops", "50", "--axis-x-m", "8", "--timeout-s", "600") as flight:
+        time.sleep(1.0)
+        for number, then_s in ((signal.SIGSTOP, 3.0), (signal.SIGCONT, 2.0)):
+            for pid in flight.nodes:
+                os.kill(pid, number)
+            time.sleep(then_s)
+        summary = flight.interrupt()
+    assert summary["lost_agents"] == summary["returned_agents"] == []
+    assert summary["missed_reports"] < 180  # of 1800 entries, for 150 slots
+    verified(flight.out)
+
+
+@pytest.mark.ros
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_the_clock_on_the_wall_ends_a_flight(tmp_path: Path, mode: str) -> None:
     words = ("--agents", "3", "--moving", "2", "--policy", "tdma", "--tail-s", "3600", "--timeout-s", "3600")

@@ -104,6 +104,15 @@ def test_what_comes_late_is_seen_late_and_a_map_of_indices_does_too() -> None:
     assert observations["agent_1"].tolist() == [7, 7, 7]
 
 
+def test_a_slot_that_begins_with_a_step_carries_what_is_sent_in_it() -> None:
+    """A step has a slot for each agent: all are heard in the step in which they send, the first one too."""
+    env = dtsa.env.channel(Counting(), owned, access="tdma", slot_ms=10, step_ms=30)
+    env.reset(seed=1)
+    for _ in range(5):
+        *_, infos = env.step({})
+        assert {age for name in NAMES for age in infos[name]["age"].values()} == {0}
+
+
 def test_agents_choose_what_they_send() -> None:
     plain = Counting()
     env = dtsa.env.channel(plain, space=Box(0, 1000, (1,), np.float32), loss=0.3)

@@ -173,12 +173,11 @@ class Relay:
         durability = min(max(qos.durability for qos in profiles), DurabilityPolicy.VOLATILE)
         qos = QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability)
         publishers, numbers = dict[int, Publisher](), itertools.count(1)
-        for row in np.flatnonzero(topic.receivers).tolist():
-            name = f"/{self._names[row]}/from/{self._names[topic.robot - 1]}/{topic.name.strip('/')}"
-            publishers[row] = self._node.create_publisher(message_type, name, qos, event_callbacks=_NO_EVENTS)
 
-        def accept(data: bytes, info: Any) -> None:  # with two parameters rclpy gives the message's number, too
-            for _ in range(_DEPTH):  # an executor takes one message at a time, and long for it
+        def accept(first: bytes, about: Any) -> None:  # with two parameters rclpy gives the message's number, too
+            more = iter(partial(subscription.handle.take_message, message_type, True), None)
+            # An executor takes one message at a time, and long for it.
+            for data, info in itertools.chain([(first, about)], itertools.islice(more, _DEPTH)):
                 number, length = info["publication_sequence_number"] or next(numbers), topic.bytes or len(data)
                 now_ns, payload = self._update_time(), (publishers, data)
                 message = RadioMessage(topic.robot, topic.name, number, length, now_ns, topic.receivers, payload)
@@ -188,11 +187,14 @@ class Relay:
                     if topic.source not in self._refused:
                         self._refused.add(topic.source)
                         self._logger.error(f"{topic.source}: a message cannot be sent: {error}")
-                if (following := subscription.handle.take_message(message_type, True)) is None:
-                    return
-                data, info = following
 
-        subscription = self._node.create_subscription(message_type, topic.source, accept, qos, raw=True)
+        try:
+            subscription = self._node.create_subscription(message_type, topic.source, accept, qos, raw=True)
+        except RuntimeError:  # of rcl: in one process a topic has one type
+            raise ConfigError("type", type_name, "that of odometry, which this topic is by the file") from None
+        for row in np.flatnonzero(topic.receivers).tolist():
+            name = f"/{self._names[row]}/from/{self._names[topic.robot - 1]}/{topic.name.strip('/')}"
+            publishers[row] = self._node.create_publisher(message_type, name, qos, event_callbacks=_NO_EVENTS)
         self._logger.info(f"{topic.source}: {type_name}")
 
     def _report(self, state: str) -> None:

@@ -70,6 +70,8 @@ class RelaySettings(Settings):
                     source = full_name(name, topic, "topics")
                     if source in topics:
                         raise ConfigError(f"topics.{topic}", source, "a topic of one robot only")
+                    if topic.strip("/") in [other.name.strip("/") for other in topics.values() if other.robot == robot]:
+                        raise ConfigError(f"topics.{topic}", source, "a topic that comes out under a name of its own")
                     with named(f"topics.{topic}"):
                         relayed = RelayedTopic.from_dict(options or {})
                         to = names if relayed.to is None else relayed.to

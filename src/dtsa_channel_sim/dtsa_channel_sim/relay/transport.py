@@ -173,7 +173,8 @@ class Transport:
         urgency = now_ns - self._heard_ns
         if self.config.access == "error" and self._positions is not None:
             urgency = np.linalg.norm(np.nan_to_num(self._positions) - self._sent_positions, axis=0)
-        return (int(np.where(ready, urgency, -np.inf).argmax()),) if any(ready) else ()
+        found = [index for index, is_ready in enumerate(ready) if is_ready]  # of equal ones the one that rested longer
+        return (max(found, key=lambda index: (urgency[index], -self._free_ns[index])),) if found else ()
 
     def _begin_radio(self, index: int, now_ns: int) -> None:
         """Let a radio begin its message; under csma it listens first, and waits longer or gives up at a busy air."""

@@ -158,6 +158,10 @@ class RealtimeChannel(RosChannel):
 
     def _hear(self, agents: Sequence[int], now: int) -> None:
         index = np.array(agents, dtype=np.intp) - 1
+        silence_ns = now - self._heard_ns.max()
+        if silence_ns > self._patience_ns:  # of all: it counts for no agent
+            self._heard_ns += silence_ns
+            self._recovered_ns = max(self._recovered_ns, now + self._patience_ns)
         self._heard_ns[index] = np.maximum(self._heard_ns[index], now)
 
     def last_place(self, agent: int) -> NDArray[np.float64]:
@@ -286,7 +290,8 @@ class RealtimeChannel(RosChannel):
         all_lost = len(self.lost) == self.agents
         if not self.pace.falls_behind(now, accounted if all_lost else min(accounted, reported)):
             return False
-        behind = "the channel is" if accounted <= reported else "the agents are"
+        is_heard = now - self._heard_ns.max() < _BEHIND_NS
+        behind = "the channel is" if accounted <= reported and is_heard else "the agents are"
         self.fell_behind = (
             f"the machine does not keep up: {behind} {(now - min(accounted, reported)) / _NS:.1f} s behind, "
             f"since {self.pace.behind_since_s:.1f} s; longer slots or fewer processes would help"
@@ -362,7 +367,9 @@ class RealtimeChannel(RosChannel):
         end = (self.slot + 2) * self.slot_ns + self._lag_ns
         if now < end + self._close_ns:
             return False
-        if now >= max(end + self._patience_ns, self._recovered_ns):
+        # Agents that are silent all together are stopped: what they report comes later.
+        is_anybody_heard = self._heard_ns.max() >= end or len(self.lost) == self.agents
+        if is_anybody_heard and now >= max(end + self._patience_ns, self._recovered_ns):
             return True
         book = self.accounts[self.slot + 2]
         return bool(book.answered.any()) and not set(book.silent) - self.lost
