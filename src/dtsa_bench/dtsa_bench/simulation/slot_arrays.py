@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
-_CAPACITY = 64  # slots to begin with
+_CAPACITY, _FEW, _MUCH = 1024, 64, 1 << 14  # slots to begin with; few of much: states of agents in a slot
 _OF_FRAMES = ("received", "data")
 _OF_OBSERVER = ("heard_slot", "heard_position", "estimate", "in_ap")
 
@@ -86,7 +86,8 @@ class SlotWriter:
         self._kept = [name for name in _ARRAYS if name not in left_out]
         for name, (letters, item) in _ARRAYS.items():
             setattr(self._arrays, name, np.empty((0, *(sizes[letter] for letter in letters)), item))
-        self._grow(_CAPACITY, _CAPACITY + config.agents)
+        slots = _FEW if config.agents * config.steps > _MUCH else _CAPACITY
+        self._grow(slots, slots + config.agents)
 
     def make_room(self) -> None:
         """Make room for further slots."""
