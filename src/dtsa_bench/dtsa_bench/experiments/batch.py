@@ -128,13 +128,6 @@ class Journal:
         self._file.close()
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a file so that a reader never sees half of it."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
-
-
 def run_in(directory: Path, batch: Batch, *, jobs: int | None = None, cluster: str | None = None) -> dict[str, Row]:
     """Do what a directory's journal does not have yet, with progress on stderr; return all rows by key.
 

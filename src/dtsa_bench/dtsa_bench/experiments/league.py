@@ -23,8 +23,9 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.yaml_file import read_yaml
 from dtsa_bench import __version__
+from dtsa_bench.runs.options import write_whole
 
-from .batch import FAILED, Batch, Row, Task, key_of, run_all, write_whole
+from .batch import FAILED, Batch, Row, Task, key_of, run_all
 from .provenance import read_provenance
 from .statistics import LEVEL, Share, wilson
 from .sweep import cost_of, run_config

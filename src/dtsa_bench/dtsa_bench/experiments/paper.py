@@ -13,8 +13,8 @@ import numpy as np
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench import __version__
 from dtsa_bench.drawing.style import save_described
+from dtsa_bench.runs.options import write_whole
 
-from .batch import write_whole
 from .charts import draw
 from .provenance import read_provenance
 from .sweep import CRASHED, MEASURES, Sweep, is_number

@@ -12,7 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .batch import FAILED, Row, write_whole
+from dtsa_bench.runs.options import write_whole
+
+from .batch import FAILED, Row
 from .statistics import Mean, Share, bootstrap_mean, wilson
 from .sweep import COMMON, CRASHED, MEASURES, VALUES, Cell, Measure, Sweep
 

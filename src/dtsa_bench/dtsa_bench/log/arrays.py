@@ -202,11 +202,6 @@ class FlightArrays:
         return [int(end) for end in np.searchsorted(rows, np.arange(len(self) + 1))]
 
     @cached_property
-    def reached(self) -> Mask:
-        """(F, N) `received`, without agents that were not there."""
-        return self.received if self.absent is None else self.received & ~self.absent[self.sent_frames.row]
-
-    @cached_property
     def known_receivers(self) -> NDArray[np.int64]:
         """(F,) other agents of which is known whether they lost a frame; the channel counts absent ones, too."""
         frames = self.sent_frames
@@ -222,6 +217,11 @@ class FlightArrays:
         if self.merged is not None:
             return np.asarray(others & (frames.received | self.known[frames.row]))
         return others if self.absent is None else others & ~self.absent[frames.row]
+
+    @cached_property
+    def reached(self) -> Mask:
+        """(F, N) of the `receivers` those that received a frame."""
+        return np.asarray(self.received & self.receivers)
 
     @cached_property
     def sender_known(self) -> Mask:

@@ -78,9 +78,8 @@ def observe(run: FlightArrays, path: str | Path, left_out: Counter[str]) -> Outc
         _, which, count = np.unique(frames.row, return_inverse=True, return_counts=True)
         good = count[which] == 1
         left_out["two senders in the slot"] += int(np.count_nonzero(~good))
-        told = run.known[frames.row, frames.sender - 1]  # of others those alone are known that somebody heard
-        left_out["no record of the sender"] += int(np.count_nonzero(good & ~told))
-        good &= told
+        left_out["no record of the sender"] += int(np.count_nonzero(good & ~run.sender_known))
+        good &= run.sender_known
     else:  # the channel has told how many lost a frame, and at how many it collided
         good = frames.collided == 0
         left_out["collided somewhere"] += int(np.count_nonzero(~good))

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,17 +58,6 @@ def render_page(
         _environment().get_template("page.html")
         .render(kind=kind, title=title, scripts=scripts, data=data, styles=styles, served=served, **values)
     )  # fmt: skip
-
-
-def write_page(path: Path, page: str) -> None:
-    """Writes a page whole or not at all: no reader sees half of it."""
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(page, encoding="utf-8")
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def flatten(config: Mapping[str, Any], section: str = "") -> list[list[Any]]:

@@ -170,6 +170,17 @@ def check_free(directory: Path, name: str = "out") -> None:
         raise ConfigError(name, str(directory), "a directory that is empty or does not exist yet")
 
 
+def write_whole(path: Path, text: str) -> None:
+    """Write a file whole or not at all: no reader sees half of it."""
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+
+
 def new_directory(path: str | Path) -> Path:
     """The directory for results, which does not exist yet, or is empty.
 

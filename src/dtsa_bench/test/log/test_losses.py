@@ -15,7 +15,7 @@ from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.experiments.sweep import make_sweep
 from dtsa_bench.log.agent_bag import read
-from dtsa_bench.log.arrays import ReceivedFrames
+from dtsa_bench.log.arrays import FlightArrays, ReceivedFrames
 from dtsa_bench.log.losses import HEARD, LOST, UNKNOWN, fit_links, learn, observe
 from dtsa_bench.log.merge.merge import Merge
 from dtsa_bench.log.merged_bag import write_merged
@@ -96,6 +96,7 @@ def test_links_without_data_lose_as_all_do_and_of_merged_flights_what_was_told_c
     )  # fmt: skip
     told = np.array([[True, True, True], [True, True, True], [True, True, False], [True, True, False]])
     run, left_out = SimpleNamespace(sent_frames=frames, agents=3, known=told, merged={}), Counter()
+    run.sender_known = FlightArrays.sender_known.func(run)
     slots, senders, outcome = observe(run, "flight", left_out)
     assert (slots.tolist(), senders.tolist()) == ([0, 2], [1, 1])
     assert outcome.tolist() == [[UNKNOWN, HEARD, LOST], [UNKNOWN, HEARD, UNKNOWN]]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
-from dtsa_bench.experiments.batch import write_whole
+from dtsa_bench.runs.options import write_whole
 
 _FILES = Path(__file__).resolve().parent / "files"
 _ALLOWED = "letters, digits and hyphens, beginning with a letter, as in my-policy"

@@ -17,8 +17,9 @@ from dtsa_bench.log.bag.errors import BagError
 from dtsa_bench.log.flight_log import FlightLog
 from dtsa_bench.log.knowledge import MeanAges
 from dtsa_bench.log.merged_bag import open_log
-from dtsa_bench.pages.html import BINS, PALETTE, SCRIPTS, flatten, pack, reduce_bins, render_page, thin, write_page
+from dtsa_bench.pages.html import BINS, PALETTE, SCRIPTS, flatten, pack, reduce_bins, render_page, thin
 from dtsa_bench.runs.delivery import as_sentence, recorded_problem
+from dtsa_bench.runs.options import write_whole
 from dtsa_channel_sim.model.verdict import OUTCOMES
 
 from .distances import collision_m, distance_chart, list_crashes, pair_distances
@@ -127,7 +128,7 @@ def _scene(run: FlightLog) -> dict[str, Any] | None:
 def _slots(run: FlightLog, reasons: _Reasons, unknown: list[int]) -> dict[str, Any]:
     """Every frame that was sent: in which slot, by whom, why, and what became of it."""
     frames, receivers = run.sent_frames, run.receivers.sum(axis=1)
-    level = np.round(254 * (frames.received & run.receivers).sum(axis=1) / np.maximum(1, receivers))
+    level = np.round(254 * run.reached.sum(axis=1) / np.maximum(1, receivers))
     return {
         "slot": pack(frames.row.astype("<u4")),
         "sender": pack(frames.sender.astype("<u2")),
@@ -211,7 +212,7 @@ def _agent_row(run: FlightLog, ages: MeanAges | None, agent: int) -> dict[str, A
     own = frames.sender == agent
     known = own & run.sender_known
     receivers = run.receivers[known]
-    heard = round(float((frames.received[known] & receivers).sum()) / max(1, int(receivers.sum())), 4)
+    heard = round(float(run.reached[known].sum()) / max(1, int(receivers.sum())), 4)
     row: dict[str, Any] = {
         "id": agent,
         "moving": bool(run.scenario.moving[agent - 1]) if run.scenario else None,
@@ -284,7 +285,7 @@ def write_report(bags: Sequence[str | Path], out: str | Path, progress: Callable
     _number_equal_names(runs)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_page(target, render(runs))
+        write_whole(target, render(runs))
     except OSError as error:
         raise BagError(f"cannot write {target}: {error.strerror or error}") from error
     return target

@@ -15,7 +15,8 @@ from dtsa_bench.experiments.paper import seeds_text
 from dtsa_bench.experiments.statistics import LEVEL, wilson
 from dtsa_bench.experiments.sweep import CRASHED
 from dtsa_bench.experiments.tables import SweepTable, label_of
-from dtsa_bench.pages.html import render_page, write_page
+from dtsa_bench.pages.html import render_page
+from dtsa_bench.runs.options import write_whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ def write_tables(
     page = render_page(
         "tables", title, scripts, {}, kicker=kicker, lead=lead, facts=facts, command=command, parts=parts
     )
-    write_page(path, page)
+    write_whole(path, page)
     return path
 
 
